@@ -1,0 +1,40 @@
+"""One received character and its status: the values that pass from a demodulator to everything behind it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+
+class Status(IntEnum):
+    """What vouches for a character; the numbers are those of ``msg/Character.msg``."""
+
+    OK = 0
+    """Start, parity and stop bits were right by evidence that could have failed."""
+    REPAIRED = 1
+    """Only the frame structure rescued it; never given by the threshold receiver."""
+    PARITY_ERROR = 2
+    """The parity bit contradicts the data bits."""
+    FRAMING_ERROR = 3
+    """The parity is right, but the start bit is not 0 or a stop bit is not 1."""
+
+
+@dataclass(frozen=True, slots=True)
+class Character:
+    """A decoded character frame.
+
+    Attributes:
+        t_ns: time of the leading edge of its start bit (ns, sensor clock).
+        code: value of the data bits (0 to 127 with 7 data bits).
+        status: see :class:`Status`.
+        confidence: 0 to 1; how far the worst bit was from being decided otherwise.
+        frame: all bits of the frame as received, first sent bit most significant (11 bits: 0 d6…d0 p 1 1).
+        bit_rate_bps: rate at which it was decoded (bit/s).
+    """
+
+    t_ns: int
+    code: int
+    status: Status
+    confidence: float
+    frame: int
+    bit_rate_bps: float

@@ -1,0 +1,229 @@
+"""Every parameter of the core, written once: name, default, unit, range, meaning.
+
+The ROS node, ``config/beacon.yaml``, the command lines and the README's table derive from the declarations in this
+file (the node's own are declared the same way in :mod:`beacon_comm.ros.parameters`).  A wrong value is refused at
+construction with its name, value and range; nothing is repaired silently.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+import math
+from typing import Any, TypeVar
+
+from beacon_comm.core.errors import ParameterError
+
+Value = bool | int | float | str | tuple[float, ...]
+T = TypeVar('T')
+
+
+@dataclass(frozen=True, slots=True)
+class Declaration:
+    """One declared parameter.
+
+    Attributes:
+        name: its name on the node, in the YAML file and (with dashes) on the command line.
+        default: its default; its type is the parameter's type.
+        unit: physical unit, '' for pure numbers.
+        low, high: inclusive range of numbers (of each entry of a list), None where not bounded.
+        choices: allowed strings, empty for other types.
+        meaning: one line.
+    """
+
+    name: str
+    default: Value
+    unit: str
+    low: float | None
+    high: float | None
+    choices: tuple[str, ...]
+    meaning: str
+
+    def check(self, value: object) -> Value:
+        """Return ``value`` in the parameter's type.
+
+        Raises:
+            ParameterError: wrong type, outside the range, or not one of the choices.
+        """
+        if isinstance(self.default, bool):
+            if not isinstance(value, bool):
+                raise ParameterError(f'{self.name} = {value!r}: must be true or false')
+            return value
+        if isinstance(self.default, str):
+            if not isinstance(value, str) or (self.choices and value not in self.choices):
+                allowed = ', '.join(self.choices) or 'a string'
+                raise ParameterError(f'{self.name} = {value!r}: must be one of {allowed}')
+            return value
+        if isinstance(self.default, tuple):
+            if not isinstance(value, (list, tuple)) or not value:
+                raise ParameterError(f'{self.name} = {value!r}: must be a list of at least one number')
+            return tuple(float(self._number(entry)) for entry in value)
+        number = self._number(value)
+        if isinstance(self.default, int):
+            if number != int(number):
+                raise ParameterError(f'{self.name} = {value!r}: must be a whole number')
+            return int(number)
+        return float(number)
+
+    def _number(self, value: object) -> float:
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+            raise ParameterError(f'{self.name} = {value!r}: must be a number')
+        if (self.low is not None and value < self.low) or (self.high is not None and value > self.high):
+            raise ParameterError(f'{self.name} = {value!r}: must lie in {self.range_text()}')
+        return value
+
+    def range_text(self) -> str:
+        """Return the range as text, for tables and errors."""
+        if self.choices:
+            return ', '.join(self.choices)
+        if isinstance(self.default, bool):
+            return 'true, false'
+        if self.low is None and self.high is None:
+            return ''
+        low = '-∞' if self.low is None else f'{self.low:g}'
+        high = '∞' if self.high is None else f'{self.high:g}'
+        return f'[{low}, {high}]{" " + self.unit if self.unit else ""}'
+
+
+def parameter(
+    default: Any,
+    meaning: str,
+    unit: str = '',
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    """Declare a parameter as a dataclass field."""
+    return field(
+        default=default, metadata={'unit': unit, 'low': low, 'high': high, 'choices': choices, 'meaning': meaning}
+    )
+
+
+def declarations(cls: type) -> tuple[Declaration, ...]:
+    """Return the declarations of a parameter dataclass, in order."""
+    return tuple(
+        Declaration(
+            f.name,
+            f.default,  # type: ignore[arg-type]
+            f.metadata['unit'],
+            f.metadata['low'],
+            f.metadata['high'],
+            f.metadata['choices'],
+            f.metadata['meaning'],
+        )
+        for f in fields(cls)
+    )
+
+
+class Declared:
+    """Base of parameter dataclasses: checks every field against its declaration."""
+
+    def __post_init__(self) -> None:
+        for declaration in declarations(type(self)):
+            object.__setattr__(self, declaration.name, declaration.check(getattr(self, declaration.name)))
+
+
+def from_mapping(cls: type[T], values: dict[str, Any]) -> T:
+    """Build parameters from a mapping such as a YAML file's.
+
+    Raises:
+        ParameterError: an unknown name, or a refused value.
+    """
+    known = {declaration.name for declaration in declarations(cls)}
+    for name in values:
+        if name not in known:
+            raise ParameterError(f'{name}: no such parameter')
+    return cls(**values)
+
+
+@dataclass(frozen=True)
+class Parameters(Declared):
+    """Parameters of the receiver."""
+
+    # Demodulation
+    receiver: str = parameter('threshold', 'demodulator of the candidate slots', choices=('threshold',))
+    bit_rates: tuple[float, ...] = parameter(
+        (504.0, 3125.0), 'bit rates to try; the one that explains most of the signal is kept', 'bps', 20.0, 10_000.0
+    )
+    cutoff_per_bit: float = parameter(
+        2.0 * math.pi / 3.0,
+        "high-pass cut-off alpha over the bit rate (2π/3: the paper's released script; 1/3: the paper's text)",
+        'rad/bit',
+        0.01,
+        20.0,
+    )
+    levels: str = parameter(
+        'adaptive', "hysteresis levels: shares of the signal's own amplitude, or fixed", choices=('adaptive', 'fixed')
+    )
+    high_share: float = parameter(0.5, 'adaptive high level over the amplitude of the filtered signal', '', 0.0, 1.0)
+    low_share: float = parameter(0.3, 'adaptive |low level| over the amplitude of the filtered signal', '', 0.0, 1.0)
+    high_level: float = parameter(20.0, 'fixed high level of the filtered signal', 'events', 0.0)
+    low_level: float = parameter(-15.0, 'fixed low level of the filtered signal', 'events', None, 0.0)
+    idle_start: bool = parameter(
+        True, 'the first fall after 10.5 or more high bits is a start bit (false: the paper to the letter)'
+    )
+
+    # Character frame
+    data_bits: int = parameter(7, 'data bits of a character', 'bit', 5, 8)
+    parity: str = parameter('even', 'parity bit', choices=('even', 'odd', 'none'))
+    stop_bits: int = parameter(2, "stop bits (the paper's end bits)", 'bit', 1, 2)
+    bit_order: str = parameter(
+        'msb_first', 'order of the data bits on the line', choices=('msb_first', 'lsb_first')
+    )
+
+    # Detection
+    hop_s: float = parameter(0.01, 'spacing of the detection grid, absolute in event time', 's', 0.001, 1.0)
+    short_window_s: float = parameter(0.02, 'short detection window', 's', 0.001, 1.0)
+    long_window_bits: float = parameter(22.0, 'long detection window, in bits of the slowest listed rate', 'bit', 1, 1000)
+    index_offset: float = parameter(10.0, 'B of the index I = n / (B + |Σσ|)', 'events', 0.1, 1000.0)
+    index_threshold: float = parameter(1.0, 'pixels below this index are no beacon', '', 0.0)
+    closing_px: int = parameter(3, 'side of the square of the morphological closing', 'px', 1, 31)
+    min_area_px: int = parameter(4, 'smallest blob', 'px', 1)
+    max_area_px: int = parameter(10_000, 'largest blob', 'px', 1)
+
+    # Tracks
+    association_gate_px: float = parameter(12.0, 'largest distance of a blob from the predicted centre', 'px', 0.1)
+    gate_growth_px_per_s: float = parameter(40.0, 'growth of the gate while a track is unseen', 'px/s', 0.0)
+    max_gate_px: float = parameter(40.0, 'largest gate', 'px', 0.1)
+    lost_after_s: float = parameter(2.0, 'a track unseen for this long is lost', 's', 0.01)
+    max_tracks: int = parameter(256, 'tracks kept at once; further blobs wait', '', 1, 65_000)
+    routing_extent_factor: float = parameter(1.5, "an event is a track's within its extent times this …", '', 0.1)
+    routing_margin_px: float = parameter(2.0, '… plus this', 'px', 0.0)
+    buffer_min_s: float = parameter(0.5, "events kept for each track: the longer of this …", 's', 0.0)
+    buffer_characters: int = parameter(30, '… and so many characters of the slowest listed rate', '', 1)
+    buffer_max_bytes: int = parameter(16_000_000, 'bound of one buffer; overflow is counted', 'byte', 1000)
+
+    # Candidate slots
+    candidate_slots: int = parameter(16, 'demodulators at work at once', '', 1, 4096)
+    reserved_candidate_slots: int = parameter(1, 'slots that confirmed beacons never take', '', 1, 4096)
+    judged_characters: int = parameter(15, 'a candidate is judged after so many counted characters, and every so many', '', 1)
+    judged_last: int = parameter(5, 'the judgement looks at so many last parities …', '', 1)
+    judged_right: int = parameter(4, '… and demotes below so many right ones', '', 0)
+    starved_after_s: float = parameter(2.0, 'a candidate with too few characters to judge for this long is demoted', 's', 0.01)
+    confirm_window: int = parameter(15, 'a confirmation looks at so many last characters …', '', 1)
+    confirm_ok: int = parameter(12, '… of which so many are ok …', '', 1)
+    confirm_distinct_codes: int = parameter(4, '… with so many distinct codes …', '', 1)
+    confirm_period: int = parameter(3, '… that do not repeat with a period of so many characters or less', '', 0)
+    allow_periodic: bool = parameter(False, 'confirm streams that repeat with a short period, too')
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.reserved_candidate_slots > self.candidate_slots:
+            raise ParameterError(
+                f'reserved_candidate_slots = {self.reserved_candidate_slots}: more than candidate_slots'
+                f' = {self.candidate_slots}'
+            )
+        if self.levels == 'fixed' and not self.high_level > -self.low_level:
+            raise ParameterError(f'high_level = {self.high_level:g}: must be above |low_level| = {-self.low_level:g}')
+        if self.levels == 'adaptive' and not self.high_share > self.low_share:
+            raise ParameterError(f'high_share = {self.high_share:g}: must be above low_share = {self.low_share:g}')
+        if self.min_area_px > self.max_area_px:
+            raise ParameterError(f'min_area_px = {self.min_area_px}: above max_area_px = {self.max_area_px}')
+        if self.judged_right > self.judged_last:
+            raise ParameterError(f'judged_right = {self.judged_right}: above judged_last = {self.judged_last}')
+        if self.confirm_ok > self.confirm_window:
+            raise ParameterError(f'confirm_ok = {self.confirm_ok}: above confirm_window = {self.confirm_window}')
+
+    @property
+    def slowest_bit_s(self) -> float:
+        """Bit period of the slowest listed rate (s)."""
+        return 1.0 / min(self.bit_rates)

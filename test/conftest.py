@@ -1,0 +1,19 @@
+"""Shared fixtures: the folder of real recordings, by ``BEACON_COMM_DATA`` or beside the project."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+PROJECT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope='session')
+def data_folder() -> Path:
+    """Return the folder of real recordings; skip without it, fail without it on CI."""
+    folder = Path(os.environ.get('BEACON_COMM_DATA', PROJECT.parent / 'shared' / 'data'))
+    if folder.is_dir():
+        return folder
+    if os.environ.get('CI', '').lower() == 'true':
+        pytest.fail(f'the recordings are missing on CI: {folder}')
+    pytest.skip(f'no recordings at {folder}; set BEACON_COMM_DATA')
