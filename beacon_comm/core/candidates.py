@@ -1,0 +1,274 @@
+"""Candidate slots: which tracks are demodulated (the paper's section III, "Detection algorithm").
+
+::
+
+    tracks ──> queue ────────────────> slots: demodulator + parity record ──> characters
+               1. never tried,         │  confirmed: keeps its slot
+                  highest index first  │  rejected, starved, demoted: gives it up at the next hop
+               2. tried before,        │  turn over (not confirmed by turn_characters, others wait): likewise
+                  longest out first <──┘
+
+Confirmed beacons hold at most ``candidate_slots - reserved_candidate_slots`` of the slots.  A candidate that is
+confirmed beyond that goes on in an extra place of its own, so that no beacon is cut off and its slot is free for the
+next candidate: there are always ``max(candidate_slots - confirmed, reserved_candidate_slots)`` slots for candidates.
+
+Slots change hands only in :meth:`CandidateSlots.assign`, on the hop grid of event time, and everything that decides
+about it is a function of the events before that hop: however the stream is cut into batches, the result is the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beacon_comm.core.character import Character
+from beacon_comm.core.confirmation import ParityRecord
+from beacon_comm.core.parameters import Parameters
+
+Times = NDArray[np.int64]
+Polarities = NDArray[np.int8]
+Backlog = Callable[[int], tuple[Times, Polarities]]
+
+
+class BeaconState(IntEnum):
+    """State of a track; the numbers are those of ``msg/Beacon.msg``."""
+
+    WAITING = 0
+    """Candidate that has not had a demodulator yet."""
+    DEMODULATING = 1
+    """Candidate with a demodulator."""
+    CONFIRMED = 2
+    """Parity has vouched for it."""
+    DEMOTED = 3
+    """It has had its turn, or parity has failed it; at the back of the queue."""
+    LOST = 4
+    """Unseen past lost_after_s."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReceivedCharacter:
+    """A character and the label of the track it came from."""
+
+    track_id: int
+    character: Character
+
+
+class SlotDemodulator(Protocol):
+    """What a slot asks of a demodulator; see :mod:`beacon_comm.core.demodulator`."""
+
+    @property
+    def bit_rate_bps(self) -> float | None:
+        """Settled bit rate (bit/s), None before."""
+
+    def push(self, t_ns: Times, polarity: Polarities, t_end_ns: int) -> list[Character]:
+        """Take events (ns; ±1) and the time up to which the stream is known (ns); return the finished characters."""
+
+    def flush(self) -> list[Character]:
+        """Return the characters still held back, as if nothing came any more."""
+
+
+class Candidate(Protocol):
+    """What the queue asks of a track; see :mod:`beacon_comm.core.tracks`."""
+
+    @property
+    def index(self) -> float:
+        """The paper's index I."""
+
+    @property
+    def quiet(self) -> bool:
+        """No events now."""
+
+
+class TrackEvents(Protocol):
+    """Events of one track; see :mod:`beacon_comm.core.routing`."""
+
+    @property
+    def track_id(self) -> int:
+        """Label of the track."""
+
+    @property
+    def t_ns(self) -> Times:
+        """Sensor time (ns), ``(n,)`` int64."""
+
+    @property
+    def polarity(self) -> Polarities:
+        """±1, ``(n,)`` int8."""
+
+
+@dataclass(slots=True)
+class _Slot:
+    demodulator: SlotDemodulator
+    record: ParityRecord
+
+
+@dataclass(frozen=True, slots=True)
+class _Tried:
+    """What remains of a turn that is over."""
+
+    ended_ns: int
+    record: ParityRecord
+
+
+_NO_TIMES: Times = np.empty(0, np.int64)
+_NO_POLARITIES: Polarities = np.empty(0, np.int8)
+
+
+class CandidateSlots:
+    """Gives tracks their turn at the demodulators, and keeps those that parity confirms.
+
+    Args:
+        parameters: see "Candidate slots" of :class:`Parameters`.
+        make_demodulator: called once for each slot that is given.
+    """
+
+    def __init__(self, parameters: Parameters, make_demodulator: Callable[[Parameters], SlotDemodulator]) -> None:
+        self._p = parameters
+        self._make_demodulator = make_demodulator
+        self._slots: dict[int, _Slot] = {}
+        self._tried: dict[int, _Tried] = {}
+        self._slots_full = False
+
+    def assign(self, tracks: Mapping[int, Candidate], t_ns: int, backlog: Backlog) -> list[ReceivedCharacter]:
+        """Free the slots of demoted tracks and give free ones to the queue.
+
+        To be called at each point of the hop grid, when every slot has been demodulated up to it.
+
+        Args:
+            tracks: the tracks now, by label; those that were lost have been forgotten.
+            t_ns: the hop's time (ns).
+            backlog: returns a track's buffered events before ``t_ns``: times (ns, ``(n,)`` int64) and polarities
+                (``(n,)`` int8).  A slot that is given starts from there; of a track that has had one, from the end
+                of that turn, so that nothing is read twice.
+
+        Returns:
+            What the backlogs of the slots given now read, in order of time.
+        """
+        for track_id, slot in self._slots.items():
+            slot.record.advance(t_ns, tracks[track_id].quiet)
+        for track_id in [track_id for track_id, slot in self._slots.items() if slot.record.demoted]:
+            self._end_turn(track_id, t_ns)
+        queue = self._queue(tracks)
+        self._end_turns_that_are_over(t_ns, len(queue) - self._free)
+        given = queue[: self._free]
+        self._slots_full = len(queue) > len(given)
+        received = []
+        for track_id in given:
+            received += self._give(track_id, t_ns, *backlog(track_id))
+        return sorted(received, key=_by_time)
+
+    def demodulate(self, routed: Iterable[TrackEvents], t_end_ns: int) -> list[ReceivedCharacter]:
+        """Hand the slots their events, and time to those without, so that a silence ends a character.
+
+        Args:
+            routed: new events, each track at most once; tracks without a slot are passed over.
+            t_end_ns: time up to which the stream is known (ns), never past the next hop.
+
+        Returns:
+            The finished characters, in order of time; a track confirmed by one is confirmed from now on.
+        """
+        events = {track.track_id: track for track in routed}
+        received = []
+        for track_id, slot in self._slots.items():
+            track = events.get(track_id)
+            t_ns, polarity = (_NO_TIMES, _NO_POLARITIES) if track is None else (track.t_ns, track.polarity)
+            received += _judged(track_id, slot, slot.demodulator.push(t_ns, polarity, t_end_ns))
+        return sorted(received, key=_by_time)
+
+    def forget(self, track_id: int) -> list[ReceivedCharacter]:
+        """Drop a lost track; return the last characters of its demodulator, if it has one."""
+        self._tried.pop(track_id, None)
+        slot = self._slots.pop(track_id, None)
+        return [] if slot is None else _judged(track_id, slot, slot.demodulator.flush())
+
+    def flush(self) -> list[ReceivedCharacter]:
+        """Return the last characters of all demodulators at the end of a stream, in order of time."""
+        received = []
+        for track_id, slot in self._slots.items():
+            received += _judged(track_id, slot, slot.demodulator.flush())
+        return sorted(received, key=_by_time)
+
+    @property
+    def slots_full(self) -> bool:
+        """Candidates with events wait because every slot is taken; as of the last hop."""
+        return self._slots_full
+
+    @property
+    def confirmed(self) -> tuple[int, ...]:
+        """Labels of the confirmed beacons, ascending."""
+        return tuple(sorted(track_id for track_id, slot in self._slots.items() if slot.record.confirmed))
+
+    def state(self, track_id: int) -> BeaconState:
+        """Return a track's state; WAITING for one that never had a slot (LOST is for the receiver to say)."""
+        record = self.record(track_id)
+        if record is None:
+            return BeaconState.WAITING
+        if track_id not in self._slots or record.demoted:
+            return BeaconState.DEMOTED
+        return BeaconState.CONFIRMED if record.confirmed else BeaconState.DEMODULATING
+
+    def record(self, track_id: int) -> ParityRecord | None:
+        """Return the record of a track's slot, or of its last turn; None if it never had one."""
+        held = self._slots.get(track_id) or self._tried.get(track_id)
+        return None if held is None else held.record
+
+    def bit_rate_bps(self, track_id: int) -> float | None:
+        """Return the settled bit rate of a track's demodulator (bit/s), None without one."""
+        slot = self._slots.get(track_id)
+        return None if slot is None else slot.demodulator.bit_rate_bps
+
+    def confirmed_at_ns(self, track_id: int) -> int | None:
+        """Return the end of the character that confirmed a track (ns), None if it is not confirmed."""
+        slot = self._slots.get(track_id)
+        return slot.record.confirmed_at_ns if slot is not None and slot.record.confirmed else None
+
+    @property
+    def _free(self) -> int:
+        """Number of slots a candidate may get now."""
+        confirmed = sum(slot.record.confirmed for slot in self._slots.values())
+        for_candidates = max(self._p.candidate_slots - confirmed, self._p.reserved_candidate_slots)
+        return for_candidates - (len(self._slots) - confirmed)
+
+    def _queue(self, tracks: Mapping[int, Candidate]) -> list[int]:
+        def place(track_id: int) -> tuple[int, float, int]:
+            tried = self._tried.get(track_id)
+            return (0, -tracks[track_id].index, track_id) if tried is None else (1, tried.ended_ns, track_id)
+
+        return sorted(
+            (track_id for track_id, track in tracks.items() if track_id not in self._slots and not track.quiet),
+            key=place,
+        )
+
+    def _end_turns_that_are_over(self, t_ns: int, wanted: int) -> None:
+        """Free up to ``wanted`` slots of candidates past ``turn_characters``, most characters first."""
+        over = [
+            (-slot.record.characters, track_id)
+            for track_id, slot in self._slots.items()
+            if not slot.record.confirmed and slot.record.characters >= self._p.turn_characters
+        ]
+        for _, track_id in sorted(over)[: max(wanted, 0)]:
+            self._end_turn(track_id, t_ns)
+
+    def _end_turn(self, track_id: int, t_ns: int) -> None:
+        self._tried[track_id] = _Tried(t_ns, self._slots.pop(track_id).record)
+
+    def _give(self, track_id: int, t_ns: int, times: Times, polarity: Polarities) -> list[ReceivedCharacter]:
+        tried = self._tried.pop(track_id, None)
+        first = 0 if tried is None else int(np.searchsorted(times, tried.ended_ns, 'left'))
+        slot = self._slots[track_id] = _Slot(self._make_demodulator(self._p), ParityRecord(self._p))
+        slot.record.advance(t_ns, quiet=False)
+        return _judged(track_id, slot, slot.demodulator.push(times[first:], polarity[first:], t_ns))
+
+
+def _judged(track_id: int, slot: _Slot, characters: list[Character]) -> list[ReceivedCharacter]:
+    for character in characters:
+        slot.record.push(character)
+    return [ReceivedCharacter(track_id, character) for character in characters]
+
+
+def _by_time(received: ReceivedCharacter) -> tuple[int, int]:
+    return received.character.t_ns, received.track_id
