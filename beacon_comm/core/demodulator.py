@@ -1,0 +1,33 @@
+"""Demodulators: events of one blob in, characters out (section III-B.3 to III-B.5)."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beacon_comm.core.character import Character
+
+
+class Demodulator(Protocol):
+    """What a candidate slot runs: events of one blob in, characters out."""
+
+    def push(self, t_ns: NDArray[np.int64], polarity: NDArray[np.int8], t_end_ns: int) -> list[Character]:
+        """Take the next events and return the characters that are decided by now, in order.
+
+        Args:
+            t_ns: event times (ns), non-decreasing, ``(n,)`` int64; ``n`` may be 0.
+            polarity: +1 or -1, ``(n,)`` int8.
+            t_end_ns: the stream's time (ns): every event still to come has ``t >= t_end_ns``.
+        """
+        ...
+
+    def flush(self) -> list[Character]:
+        """End the stream: return the characters that are complete but still held."""
+        ...
+
+    @property
+    def bit_rate_bps(self) -> float | None:
+        """The settled bit rate (bit/s), None before."""
+        ...
