@@ -1,0 +1,184 @@
+"""A scene: beacons and a background merged by event time into one event stream, and into EventPackets.
+
+    beacon 0   ·· ··· ··  ·····           ┐
+    beacon 1      ··· ·· ···· ····        ├─ by event time ─→ | 4 ms | 4 ms | 4 ms | …   seq 0, 1, 2 …
+    background ························   ┘
+
+A packet is stamped with the time of its first event (its own begin, if it has none): stamp = ``stamp_start_ns`` +
+scene time.  It counts as recorded when its last event can have been: at its end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beacon_comm.core.errors import ParameterError
+from beacon_comm.core.events import NS_PER_S, EventBatch
+from beacon_comm.recordings.bags import Message
+from beacon_comm.recordings.sources import Background, Beacon
+from beacon_comm.wire.cdr import build_event_packet
+from beacon_comm.wire.evt3_encoder import Evt3Encoder
+
+PACKET_PERIOD_S = 0.004
+STAMP_START_NS = 1_700_000_000 * NS_PER_S  # fixed, so that the same scene gives the same bytes
+
+
+class _Events(NamedTuple):
+    x: NDArray[np.uint16]
+    y: NDArray[np.uint16]
+    polarity: NDArray[np.int8]
+    t_ns: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Beacons over an optional background.
+
+    Attributes:
+        beacons: at least one.
+        width, height: the sensor's size (pixels).
+        background: None for none.
+        packet_period_ns: length of a packet in event time (ns).
+        stamp_start_ns: ROS time at scene time 0 (ns).
+        seed: seed of the pixels.
+        frame_id: frame of the camera.
+
+    Raises:
+        ParameterError: no beacon, or the background is of another sensor size.
+    """
+
+    beacons: tuple[Beacon, ...]
+    width: int
+    height: int
+    background: Background | None = None
+    packet_period_ns: int = round(PACKET_PERIOD_S * NS_PER_S)
+    stamp_start_ns: int = STAMP_START_NS
+    seed: int = 0
+    frame_id: str = 'event_camera'
+
+    def __post_init__(self) -> None:
+        if not self.beacons:
+            raise ParameterError('a scene needs at least one beacon')
+        if self.packet_period_ns < 1000:
+            raise ParameterError(f'packet period {self.packet_period_ns} ns: must be at least 1 µs')
+        sizes = [(beacon.disc.width, beacon.disc.height) for beacon in self.beacons]
+        if self.background is not None:
+            sizes.append((self.background.width, self.background.height))
+        for width, height in sizes:
+            if (width, height) != (self.width, self.height):
+                raise ParameterError(
+                    f'sensor {self.width}×{self.height}: a part of the scene is of {width}×{height}'
+                )
+
+    @property
+    def end_ns(self) -> int:
+        """Scene time at which its last beacon ends (ns)."""
+        return max(beacon.end_ns for beacon in self.beacons)
+
+    def batches(self, start_s: float = 0.0, duration_s: float | None = None) -> Iterator[EventBatch]:
+        """Yield the merged events, one batch a packet period, empty ones too.
+
+        Args:
+            start_s: scene time to begin at (s); what is earlier is left out.
+            duration_s: how long (s); None: to the end of the last beacon.  The background goes on beyond that.
+        """
+        start_ns, stop_ns = self._span(start_s, duration_s)
+        beacons = self._beacon_events()
+        background = _Pending(self.background.batches() if self.background is not None else iter(()))
+        background.take_until(start_ns)
+        at = int(np.searchsorted(beacons.t_ns, start_ns))
+        for begin_ns in range(start_ns, stop_ns, self.packet_period_ns):
+            end_ns = min(begin_ns + self.packet_period_ns, stop_ns)
+            until = int(np.searchsorted(beacons.t_ns, end_ns))
+            part = _Events(*(column[at:until] for column in beacons))
+            merged = _merged([part, *background.take_until(end_ns)])
+            yield EventBatch(merged.x, merged.y, merged.polarity, merged.t_ns, end_ns)
+            at = until
+
+    def packets(self, start_s: float = 0.0, duration_s: float | None = None, loop: bool = False) -> Iterator[Message]:
+        """Yield ``(recorded_ns, cdr)`` of EventPackets (evt3) with the merged events.
+
+        Args:
+            start_s, duration_s: see :meth:`batches`.
+            loop: for ever; the clock, the stamps and ``seq`` run on.
+        """
+        encoder = Evt3Encoder(self.width, self.height)
+        shift_ns = 0
+        seq = 0
+        while True:
+            end_ns = begin_ns = self._span(start_s, duration_s)[0]
+            for batch in self.batches(start_s, duration_s):
+                first_ns = int(batch.t_ns[0]) if len(batch) else end_ns
+                end_ns = batch.t_end_ns
+                shifted = EventBatch(batch.x, batch.y, batch.polarity, batch.t_ns + shift_ns, end_ns + shift_ns)
+                cdr = build_event_packet(
+                    stamp_ns=self.stamp_start_ns + shift_ns + first_ns,
+                    frame_id=self.frame_id,
+                    width=self.width,
+                    height=self.height,
+                    seq=seq,
+                    time_base_ns=0,
+                    encoding='evt3',
+                    payload=encoder.encode(shifted),
+                )
+                yield self.stamp_start_ns + shifted.t_end_ns, cdr
+                seq += 1
+            if not loop or end_ns == begin_ns:
+                return
+            shift_ns += end_ns - begin_ns
+
+    def packet_count(self, start_s: float = 0.0, duration_s: float | None = None) -> int:
+        """Return how many packets one pass of :meth:`packets` has."""
+        return len(range(*self._span(start_s, duration_s), self.packet_period_ns))
+
+    def _span(self, start_s: float, duration_s: float | None) -> tuple[int, int]:
+        start_ns = round(start_s * 1e6) * 1000
+        return start_ns, self.end_ns if duration_s is None else start_ns + round(duration_s * 1e6) * 1000
+
+    def _beacon_events(self) -> _Events:
+        placed = []
+        for index, beacon in enumerate(self.beacons):
+            x, y = beacon.disc.pixels(beacon.t_ns, [self.seed, index])
+            placed.append(_Events(x, y, beacon.polarity, beacon.t_ns))
+        return _merged(placed)
+
+
+class _Pending:
+    """Events of a stream of batches, taken piecewise by time."""
+
+    def __init__(self, batches: Iterator[EventBatch]) -> None:
+        self._batches = batches
+        self._waiting: list[_Events] = []
+        self._known_ns = -1
+        self._exhausted = False
+
+    def take_until(self, t_ns: int) -> list[_Events]:
+        """Return the next events before ``t_ns`` (ns), in order."""
+        while not self._exhausted and self._known_ns < t_ns:
+            batch = next(self._batches, None)
+            if batch is None:
+                self._exhausted = True
+                break
+            self._waiting.append(_Events(batch.x, batch.y, batch.polarity, batch.t_ns))
+            self._known_ns = int(batch.t_ns[-1])
+        taken, kept = [], []
+        for events in self._waiting:
+            split = int(np.searchsorted(events.t_ns, t_ns))
+            taken.append(_Events(*(column[:split] for column in events)))
+            if split < len(events.t_ns):
+                kept.append(_Events(*(column[split:] for column in events)))
+        self._waiting = kept
+        return taken
+
+
+def _merged(parts: list[_Events]) -> _Events:
+    """Merge by time, in whole microseconds, which is what EVT3 carries; at the same time the first part comes first."""
+    together = _Events(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    t_ns = together.t_ns // 1000 * 1000
+    order = np.argsort(t_ns, kind='stable')
+    return _Events(together.x[order], together.y[order], together.polarity[order], t_ns[order])
