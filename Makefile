@@ -50,10 +50,13 @@ clean:
 	rm -rf $(VENV) build install log *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find beacon_comm test launch scripts -name __pycache__ -type d -prune -exec rm -rf {} +
 
+# An environment does not survive its folder being moved or its Python being taken away: make it anew.
+$(shell grep -qsxF '$(CURDIR)' $(STAMPS)/python && [ -x $(BIN)/python ] || rm -rf $(STAMPS))
+
 $(STAMPS)/python:
 	@scripts/check_compiler
 	@python=$$(scripts/find_python) && echo "setup: making $(VENV) with $$python" && "$$python" -m venv --clear $(VENV)
-	@mkdir -p $(STAMPS) && touch $@
+	@mkdir -p $(STAMPS) && echo '$(CURDIR)' > $@
 
 $(STAMPS)/requirements: setup.cfg pyproject.toml scripts/requirements.py | $(STAMPS)/python
 	@echo 'setup: installing ROS 2, libraries and tools from PyPI (some minutes the first time)'
@@ -61,14 +64,14 @@ $(STAMPS)/requirements: setup.cfg pyproject.toml scripts/requirements.py | $(STA
 	@$(BIN)/python -m pip install --quiet --requirement $(VENV)/requirements.txt
 	@touch $@
 
-$(STAMPS)/package: $(STAMPS)/requirements $(BUILD_FILES) $(MESSAGES) msg
+$(STAMPS)/package: $(BUILD_FILES) $(MESSAGES) msg | $(STAMPS)/requirements
 	@echo 'setup: building and installing beacon_comm with its messages'
 	@$(BIN)/python scripts/link_sources.py --remove
 	@$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --force-reinstall .
 	@touch $@
 
-# apt's event_camera_msgs has no wheel, so the message is built from our definition of it.
-$(STAMPS)/event_camera_msgs: $(STAMPS)/requirements $(INTERFACE_FILES) cmake/ros_wheels.cmake
+# event_camera_msgs is on apt only, so the message is built from our definition of it, once it is missing.
+$(STAMPS)/event_camera_msgs: $(INTERFACE_FILES) cmake/ros_wheels.cmake | $(STAMPS)/requirements
 	@if [ -e $@ ] || ! $(BIN)/python -c 'import event_camera_msgs' 2>/dev/null; then \
 	  echo 'setup: building event_camera_msgs from $(INTERFACE)' && \
 	  export AMENT_PREFIX_PATH=$(abspath $(VENV)) && \

@@ -5,10 +5,10 @@ interfaces, share/ and lib/beacon_comm/ into the environment's prefix.
 """
 
 import os
-from pathlib import Path
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 from setuptools import Distribution, setup
 from setuptools.command.build_py import build_py

@@ -4,14 +4,17 @@ pip installs copies.  Each installed file that comes straight from the checkout 
 configuration or launch file) is replaced by a link to it, so that an edit counts at once and the
 messages are compiled only when they change.  ``--remove`` takes the links away again, which has to come
 before pip installs anew: it must not follow a link and write into the checkout.
+
+numba's caches of compiled functions know the file of the function alone, not those of the functions it
+calls: all caches older than the newest module are deleted.
 """
 
 import argparse
-from collections.abc import Iterator
 import os
-from pathlib import Path
 import sys
 import sysconfig
+from collections.abc import Iterator
+from pathlib import Path
 
 HERE = Path(__file__).resolve().parents[1]
 PACKAGE = 'beacon_comm'
@@ -60,6 +63,15 @@ def make_links(folder: Path, installed: Path) -> None:
         link.symlink_to(target)
 
 
+def clear_stale_caches() -> None:
+    """Delete compiled functions that are older than any module they may have been compiled from."""
+    newest = max(path.stat().st_mtime for path in (HERE / PACKAGE).rglob('*.py'))
+    for folder in (SITE, HERE / PACKAGE):
+        for path in folder.rglob('__pycache__/*.nb[ci]'):
+            if path.stat().st_mtime < newest:
+                path.unlink()
+
+
 def main() -> None:
     """Run as a step of ``make setup``."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -70,6 +82,7 @@ def main() -> None:
             remove_links(installed)
         else:
             make_links(folder, installed)
+    clear_stale_caches()
 
 
 if __name__ == '__main__':

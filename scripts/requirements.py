@@ -1,8 +1,8 @@
 """Prints what the environment needs before the package: its own, its tests' and its build's requirements."""
 
 import configparser
-from pathlib import Path
 import tomllib
+from pathlib import Path
 
 HERE = Path(__file__).resolve().parents[1]
 
