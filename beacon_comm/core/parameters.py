@@ -175,16 +175,25 @@ class Parameters(Declared):
     short_window_s: float = parameter(0.02, 'short detection window', 's', 0.001, 1.0)
     long_window_bits: float = parameter(22.0, 'long detection window, in bits of the slowest listed rate', 'bit', 1, 1000)
     index_offset: float = parameter(10.0, 'B of the index I = n / (B + |Σσ|)', 'events', 0.1, 1000.0)
-    index_threshold: float = parameter(1.0, 'pixels below this index are no beacon', '', 0.0)
+    index_threshold: float = parameter(1.0, 'a blob has a pixel of at least this index …', '', 0.0)
+    index_grow_share: float = parameter(
+        0.5, '… and grows over neighbours above this share of it (1: one threshold, as the paper)', '', 0.1, 1.0
+    )
     closing_px: int = parameter(3, 'side of the square of the morphological closing', 'px', 1, 31)
     min_area_px: int = parameter(4, 'smallest blob', 'px', 1)
     max_area_px: int = parameter(10_000, 'largest blob', 'px', 1)
+    window_max_bytes: int = parameter(
+        256_000_000, 'bound of the events kept for the windows; overflow is counted', 'byte', 1000
+    )
 
     # Tracks
     association_gate_px: float = parameter(12.0, 'largest distance of a blob from the predicted centre', 'px', 0.1)
     gate_growth_px_per_s: float = parameter(40.0, 'growth of the gate while a track is unseen', 'px/s', 0.0)
     max_gate_px: float = parameter(40.0, 'largest gate', 'px', 0.1)
     lost_after_s: float = parameter(2.0, 'a track unseen for this long is lost', 's', 0.01)
+    merge_after_s: float = parameter(
+        0.5, 'a track inside the blob of an older one for this long is dropped', 's', 0.0
+    )
     max_tracks: int = parameter(256, 'tracks kept at once; further blobs wait', '', 1, 65_000)
     routing_extent_factor: float = parameter(1.5, "an event is a track's within its extent times this …", '', 0.1)
     routing_margin_px: float = parameter(2.0, '… plus this', 'px', 0.0)
