@@ -1,0 +1,218 @@
+"""Detection: events in, tracks and their events out (paper, section III, "Detection algorithm").
+
+    events ──► routing ──► the tracks' buffers ──► candidate slots
+                 │  ▲
+           hop   ▼  │ aim
+           index images ──► blobs ──► tracks
+
+Routing in a hop interval depends on nothing but the tracks at the last hop, and everything else happens at hops, so
+any batching of the same events gives the same tracks and the same routed events.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from beacon_comm.core.blobs import Blob, BlobFinder
+from beacon_comm.core.event_buffer import EventBuffer, buffer_length_ns
+from beacon_comm.core.events import EventBatch
+from beacon_comm.core.index_image import IndexImages, hop_length_ns
+from beacon_comm.core.parameters import Parameters
+from beacon_comm.core.routing import Routed, Router
+from beacon_comm.core.tracks import Track, TrackChanges, Tracker
+
+
+@dataclass(slots=True)
+class DetectionStats:
+    """What detection has counted since it was made.
+
+    Attributes:
+        hops: hops that were looked at.
+        events, routed_events: events taken, and those of them that were routed to a track.
+        outside_events: events beyond the sensor's borders.
+        blobs: blobs of the last hop.
+        waiting_blobs: blobs of the last hop that got no track because ``max_tracks`` are kept.
+        new_tracks, lost_tracks: tracks that began and ended.
+        window_overflow_events: events dropped from the windows (``window_max_bytes``).
+        buffer_overflow_events: events dropped from buffers (``buffer_max_bytes``).
+    """
+
+    hops: int = 0
+    events: int = 0
+    routed_events: int = 0
+    outside_events: int = 0
+    blobs: int = 0
+    waiting_blobs: int = 0
+    new_tracks: int = 0
+    lost_tracks: int = 0
+    window_overflow_events: int = 0
+    buffer_overflow_events: int = 0
+
+
+class Detector:
+    """Finds and follows blobs on one sensor and hands out their events.
+
+    Args:
+        parameters: those under "Detection" and "Tracks".
+        sensor_size: width and height (px).
+    """
+
+    def __init__(self, parameters: Parameters, sensor_size: tuple[int, int]) -> None:
+        self._parameters = parameters
+        self._hop_ns = hop_length_ns(parameters)
+        self._buffer_ns = buffer_length_ns(parameters)
+        self._tracker = Tracker(parameters)
+        self._buffers: dict[int, EventBuffer] = {}
+        self._stats = DetectionStats()
+        self._outside_before = self._overflow_before = 0
+        self._start(sensor_size)
+
+    def _start(self, sensor_size: tuple[int, int]) -> None:
+        self._sensor_size = sensor_size
+        self._images = IndexImages(self._parameters, sensor_size)
+        self._blobs = BlobFinder(self._parameters, sensor_size)
+        self._router = Router(self._parameters, sensor_size)
+        self._t_hop_ns: int | None = None  # the last point of the hop grid
+        self._early = TrackChanges()  # changes at hops that route() had to catch up with
+
+    @property
+    def tracks(self) -> Mapping[int, Track]:
+        """All tracks by label, oldest first."""
+        return self._tracker.tracks
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing can change at coming hops without events: no track, and no event in any window."""
+        return not self._tracker.tracks and self._images.empty and not self._router.gathered
+
+    @property
+    def stats(self) -> DetectionStats:
+        """What has been counted so far."""
+        self._stats.outside_events = self._outside_before + self._router.outside_events
+        self._stats.window_overflow_events = self._overflow_before + self._images.overflow_events
+        return self._stats
+
+    def route(self, segment: EventBatch) -> list[Routed]:
+        """Route the events of one hop interval, or of a part of it, by the tracks at the last hop.
+
+        Returns:
+            The events of each track that got any; they are in the tracks' buffers, too.
+        """
+        if len(segment) == 0:
+            return []
+        t_hop_ns = int(segment.t_ns[0]) // self._hop_ns * self._hop_ns
+        if self._t_hop_ns is None:
+            self._t_hop_ns = t_hop_ns
+            self._router.aim((), t_hop_ns)
+        elif t_hop_ns > self._t_hop_ns:
+            self._early = self.hop(t_hop_ns)
+        routed = self._router.route(segment)
+        self._stats.events += len(segment)
+        for part in routed:
+            self._stats.routed_events += len(part.t_ns)
+            self._buffers[part.track_id].append(part.t_ns, part.polarity)
+        return routed
+
+    def hop(self, t_hop_ns: int) -> TrackChanges:
+        """Close the hop interval that ends at ``t_hop_ns`` (ns), a point of the grid; catch up with those before.
+
+        Returns:
+            The tracks that are new and lost since the last call.
+        """
+        if self._t_hop_ns is None:
+            self._t_hop_ns = t_hop_ns - self._hop_ns
+        new, lost = list(self._early.new), list(self._early.lost)
+        self._early = TrackChanges()
+        while self._t_hop_ns < t_hop_ns:
+            self._t_hop_ns = t_hop_ns if self.idle else self._t_hop_ns + self._hop_ns
+            changes = self._step(self._t_hop_ns)
+            new += changes.new
+            lost += changes.lost
+        return TrackChanges(tuple(new), tuple(lost), waiting=self._stats.waiting_blobs)
+
+    def backlog(self, track_id: int) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
+        """Return the buffered events of a track: times (ns), ``(n,)`` int64, and ±1, ``(n,)`` int8.
+
+        What is routed to it after this call follows on without a gap.
+
+        Raises:
+            KeyError: no such track.
+        """
+        return self._buffers[track_id].events()
+
+    def resize(self, sensor_size: tuple[int, int]) -> TrackChanges:
+        """Go on with another sensor size ``(width, height)`` (px): all tracks are lost, labels go on."""
+        self._outside_before += self._router.outside_events
+        self._overflow_before += self._images.overflow_events
+        changes = TrackChanges(lost=self._early.lost + self._tracker.clear().lost)
+        self._stats.lost_tracks += len(changes.lost) - len(self._early.lost)
+        self._buffers.clear()
+        self._start(sensor_size)
+        return changes
+
+    def reset(self) -> TrackChanges:
+        """Go on after the sensor's clock was restarted: all tracks are lost, labels go on."""
+        return self.resize(self._sensor_size)
+
+    def _step(self, t_hop_ns: int) -> TrackChanges:
+        """Take one hop; the paper's detection, one call a stage."""
+        self._images.push(self._router.close())
+        blobs = self._blobs.find(self._images, t_hop_ns)
+        changes = self._tracker.update(blobs, t_hop_ns)
+        self._keep_buffers(blobs, changes, t_hop_ns)
+        self._router.aim(tuple(self._tracker.tracks.values()), t_hop_ns)
+        self._stats.hops += 1
+        self._stats.blobs = len(blobs)
+        self._stats.waiting_blobs = changes.waiting
+        self._stats.new_tracks += len(changes.new)
+        self._stats.lost_tracks += len(changes.lost)
+        return changes
+
+    def _keep_buffers(self, blobs: list[Blob], changes: TrackChanges, t_hop_ns: int) -> None:
+        for track in changes.lost:
+            del self._buffers[track.track_id]
+        if changes.new:
+            self._begin_buffers(blobs, changes)
+        for buffer in self._buffers.values():
+            self._stats.buffer_overflow_events += buffer.trim(t_hop_ns)
+
+    def _begin_buffers(self, blobs: list[Blob], changes: TrackChanges) -> None:
+        """Begin each new track's buffer with the events on its blob's pixels that are in the blob's window."""
+        for track in changes.new:
+            self._buffers[track.track_id] = EventBuffer(self._buffer_ns, self._parameters.buffer_max_bytes)
+        for w, window in enumerate(self._images.windows):
+            begun = [(t, b) for t, b in zip(changes.new, changes.new_blobs, strict=True) if blobs[b].window == w]
+            if not begun:
+                continue
+            wanted = np.zeros(len(blobs) + 1, np.bool_)
+            wanted[[b + 1 for _, b in begun]] = True
+            for events in self._images.hop_events(window):
+                place, number = _events_on(events.word, self._sensor_size[0], self._blobs.owner, wanted)
+                for track, b in begun:
+                    of = place[number == b + 1]
+                    polarity = np.where(events.word[of] & 1, 1, -1).astype(np.int8)
+                    self._buffers[track.track_id].append(events.t_ns[of], polarity)
+
+
+@njit(cache=True, nogil=True)
+def _events_on(word, width, owner, wanted):  # type: ignore[no-untyped-def]
+    """Return places and blob numbers of the events that no track got and that lie on a wanted blob."""
+    place = np.empty(len(word), np.int64)
+    number = np.empty(len(word), np.int32)
+    n = 0
+    for i in range(len(word)):
+        if word[i] & 2:
+            continue
+        x = np.int64((word[i] >> 2) & 0x3FFF)
+        y = np.int64(word[i] >> 16)
+        b = owner[y * width + x]
+        if b > 0 and wanted[b]:
+            place[n] = i
+            number[n] = b
+            n += 1
+    return place[:n], number[:n]

@@ -1,0 +1,61 @@
+"""Which circles may hold a pixel: for every cell of 16 x 16 pixels a list of them, in their own order.
+
+    cell      row by row          member[first[cell] : first[cell + 1]]
+
+An event looks at its cell's list alone, so its cost does not grow with the number of circles on the sensor.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+CELL_SHIFT = 4
+
+
+def cells_along(length_px: int) -> int:
+    """Return how many cells a side of the sensor needs."""
+    return ((length_px - 1) >> CELL_SHIFT) + 1
+
+
+def cell_lists(
+    box: NDArray[np.float64], width: int, height: int
+) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """List the boxes that touch each cell.
+
+    Args:
+        box: left, right, top, bottom (px), ``(m, 4)`` float64.
+        width, height: of the sensor (px).
+
+    Returns:
+        ``first``, ``(cells + 1,)`` int64, and ``member``, int32; see the module's head.
+    """
+    first, member = _cell_lists(box, width, height, cells_along(width), cells_along(height))
+    return first, member
+
+
+@njit(cache=True, nogil=True)
+def _cell_lists(box, width, height, across, down):  # type: ignore[no-untyped-def]
+    m = len(box)
+    span = np.zeros((m, 4), np.int64)
+    first = np.zeros(across * down + 1, np.int64)
+    for k in range(m):
+        span[k, 0] = np.int64(min(max(np.floor(box[k, 0]), 0.0), width)) >> CELL_SHIFT
+        span[k, 1] = np.int64(min(max(np.ceil(box[k, 1]), -1.0), width - 1.0)) >> CELL_SHIFT
+        span[k, 2] = np.int64(min(max(np.floor(box[k, 2]), 0.0), height)) >> CELL_SHIFT
+        span[k, 3] = np.int64(min(max(np.ceil(box[k, 3]), -1.0), height - 1.0)) >> CELL_SHIFT
+        for row in range(span[k, 2], span[k, 3] + 1):
+            for column in range(span[k, 0], span[k, 1] + 1):
+                first[row * across + column + 1] += 1
+    for cell in range(across * down):
+        first[cell + 1] += first[cell]
+    member = np.empty(first[-1], np.int32)
+    end = first.copy()
+    for k in range(m):
+        for row in range(span[k, 2], span[k, 3] + 1):
+            for column in range(span[k, 0], span[k, 1] + 1):
+                cell = row * across + column
+                member[end[cell]] = k
+                end[cell] += 1
+    return first, member

@@ -1,0 +1,303 @@
+"""Tracks: blobs followed from hop to hop under a label that is never given again.
+
+    blobs of a hop ──► nearest pairs first, within the gate ──► matched:   the filter takes the observation
+                                                           ├──► no blob:   quiet, position predicted, then lost
+                                                           └──► no track:  a new one, strongest blob first
+
+The filter is a Kalman filter of constant velocity, both axes alike.  An observation is the mean of n events of a
+disc of radius R, so its variance is R² / 4n an axis: a dim blob moves a track little, a bright one at once.
+A prediction goes on at constant velocity for a moment and then fades, so that it stays within bounds:
+
+    distance(dt) = v s(dt),   s = dt for dt <= 0.1 s,   0.1 s + 1 s (1 - exp(-(dt - 0.1 s) / 1 s)) after
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numba import njit
+
+from beacon_comm.core.blobs import Blob
+from beacon_comm.core.events import NS_PER_S
+from beacon_comm.core.parameters import Parameters
+
+_STEADY_S = 0.1  # a prediction goes on unchanged for this long …
+_FADE_S = 1.0  # … and then fades with this time constant
+_ACCELERATION = 400.0  # white acceleration of the filter (px²/s³): 2 px/s more uncertain after 10 ms
+_FIRST_SPEED_PX_PER_S = 200.0  # standard deviation of an unknown velocity
+_FLOOR_PX = 0.05  # an observation is never better than this
+_SURPRISE = 16.0  # an innovation of more than 4 standard deviations is a manoeuvre
+_EXTENT_RISE, _EXTENT_FALL = 0.5, 0.05  # an extent grows at once and shrinks slowly
+
+
+@dataclass(slots=True)
+class Track:
+    """One followed blob.
+
+    Attributes:
+        track_id: label, never given twice.
+        x_px, y_px: centre (px) at ``t_ns``.
+        t_ns: time (ns) of the state.
+        extent_px: radius of the blob.
+        index: the index I of its last blob.
+        first_seen_ns, last_seen_ns: times (ns) of its first and its last observation.
+        vx_px_per_s, vy_px_per_s: image velocity (px/s).
+        quiet: no blob at the last hop; the position is predicted.
+        matched_ns: the last hop (ns) that had a blob of it.
+        covered_since_ns: since when (ns) an older track has had the blob it lies in, None: it lies in none.
+        variance: of position (px²), of position and velocity (px²/s), of velocity (px²/s²), one axis.
+    """
+
+    track_id: int
+    x_px: float
+    y_px: float
+    t_ns: int
+    extent_px: float
+    index: float
+    first_seen_ns: int
+    last_seen_ns: int
+    vx_px_per_s: float = 0.0
+    vy_px_per_s: float = 0.0
+    quiet: bool = False
+    matched_ns: int = 0
+    covered_since_ns: int | None = None
+    variance: tuple[float, float, float] = field(default=(1.0, 0.0, _FIRST_SPEED_PX_PER_S**2))
+
+    def position_at(self, t_ns: int) -> tuple[float, float]:
+        """Return the predicted centre (px) at ``t_ns`` (ns)."""
+        s = _fading_s((t_ns - self.t_ns) / NS_PER_S)
+        return self.x_px + self.vx_px_per_s * s, self.y_px + self.vy_px_per_s * s
+
+    def observe(self, x_px: float, y_px: float, t_ns: int, variance_px2: float) -> None:
+        """Take an observation at ``t_ns``; one that is older than the state counts as of the state's time."""
+        t_ns = max(t_ns, self.t_ns)
+        dt = (t_ns - self.t_ns) / NS_PER_S
+        x, y = self.position_at(t_ns)
+        dx, dy = x_px - x, y_px - y
+        pp, pv, vv = self.variance
+        q = _ACCELERATION
+        pp, pv, vv = pp + dt * (2 * pv + dt * (vv + q * dt / 3)), pv + dt * (vv + q * dt / 2), vv + q * dt
+        surprise = dx * dx + dy * dy
+        if dt > 0 and surprise > _SURPRISE * (pp + variance_px2):
+            vv += surprise / dt**2
+            pv += surprise / dt
+            pp += surprise
+        gain = pp + variance_px2
+        kp, kv = pp / gain, pv / gain
+        self.x_px, self.y_px, self.t_ns = x + kp * dx, y + kp * dy, t_ns
+        self.vx_px_per_s += kv * dx
+        self.vy_px_per_s += kv * dy
+        self.variance = (1 - kp) * pp, (1 - kp) * pv, vv - kv * pv
+
+    def fall_quiet(self) -> None:
+        """Go on by prediction; of the velocity only what is certain is kept, so that a still blob stays."""
+        speed2 = self.vx_px_per_s**2 + self.vy_px_per_s**2
+        kept = max(0.0, 1.0 - 8.0 * self.variance[2] / speed2) if speed2 > 0 else 0.0
+        self.vx_px_per_s *= kept
+        self.vy_px_per_s *= kept
+        self.quiet = True
+
+
+@dataclass(frozen=True, slots=True)
+class TrackChanges:
+    """What a hop changed.
+
+    Attributes:
+        new: tracks that began.
+        lost: tracks that ended, as they were.
+        new_blobs: for each new track, which of the hop's blobs it began with.
+        waiting: blobs that got no track because ``max_tracks`` are kept.
+    """
+
+    new: tuple[Track, ...] = ()
+    lost: tuple[Track, ...] = ()
+    new_blobs: tuple[int, ...] = ()
+    waiting: int = 0
+
+
+class Tracker:
+    """Keeps the tracks.
+
+    Args:
+        parameters: those under "Tracks".
+    """
+
+    def __init__(self, parameters: Parameters) -> None:
+        self._parameters = parameters
+        self._lost_after_ns = round(parameters.lost_after_s * NS_PER_S)
+        self._merge_after_ns = round(parameters.merge_after_s * NS_PER_S)
+        self._tracks: dict[int, Track] = {}
+        self._next_id = 1
+
+    @property
+    def tracks(self) -> Mapping[int, Track]:
+        """All tracks by label, oldest first."""
+        return self._tracks
+
+    def update(self, blobs: Sequence[Blob], t_hop_ns: int) -> TrackChanges:
+        """Associate the blobs of the hop that ends at ``t_hop_ns`` (ns)."""
+        if not blobs and not self._tracks:
+            return TrackChanges()
+        tracks = list(self._tracks.values())
+        blob_of, track_of = self._associate(tracks, blobs, t_hop_ns)
+        covering = self._covering(tracks, blobs, blob_of, track_of, t_hop_ns)
+        for i, track in enumerate(tracks):
+            if blob_of[i] >= 0:
+                _take(track, blobs[blob_of[i]], t_hop_ns)
+            else:
+                _miss(track, covering[i] >= 0, t_hop_ns)
+        lost = tuple(track for track in tracks if self._ended(track, t_hop_ns))
+        for track in lost:
+            del self._tracks[track.track_id]
+        new, new_blobs, waiting = self._begin(tracks, blobs, blob_of, track_of, t_hop_ns)
+        return TrackChanges(new, lost, new_blobs, waiting)
+
+    def clear(self) -> TrackChanges:
+        """Lose every track; labels go on."""
+        lost = tuple(self._tracks.values())
+        self._tracks.clear()
+        return TrackChanges(lost=lost)
+
+    def _associate(
+        self, tracks: list[Track], blobs: Sequence[Blob], t_hop_ns: int
+    ) -> tuple[list[int], list[int]]:
+        """Return each track's blob and each blob's track, -1 for none: globally nearest pairs first."""
+        blob_of, track_of = [-1] * len(tracks), [-1] * len(blobs)
+        if not tracks or not blobs:
+            return blob_of, track_of
+        p = self._parameters
+        state = np.empty((len(tracks), 5))
+        for i, track in enumerate(tracks):
+            unseen_s = max(0, t_hop_ns - track.matched_ns) / NS_PER_S
+            gate = min(p.max_gate_px, p.association_gate_px + p.gate_growth_px_per_s * unseen_s)
+            # The centre of a large blob is uncertain by a share of its size.
+            state[i, :2] = track.position_at(t_hop_ns)
+            state[i, 2:] = track.vx_px_per_s, track.vy_px_per_s, max(gate, track.extent_px)
+        seen = np.array([(blob.x_px, blob.y_px, (t_hop_ns - blob.t_ns) / NS_PER_S) for blob in blobs])
+        first, second, distance2 = _pairs(state, seen)
+        for k in np.lexsort((second, first, distance2)):
+            i, j = int(first[k]), int(second[k])
+            if blob_of[i] < 0 and track_of[j] < 0:
+                blob_of[i], track_of[j] = j, i
+        return blob_of, track_of
+
+    @staticmethod
+    def _covering(
+        tracks: list[Track], blobs: Sequence[Blob], blob_of: list[int], track_of: list[int], t_hop_ns: int
+    ) -> list[int]:
+        """Return for each track without a blob the one it lies in, -1 for none.
+
+        An older track takes such a blob over from a younger one: of tracks that merge the older goes on.
+        """
+        covering = [-1] * len(tracks)
+        matched = [j for j in range(len(blobs)) if track_of[j] >= 0]
+        if not matched or all(j >= 0 for j in blob_of):
+            return covering
+        seen = np.array([(blobs[j].x_px, blobs[j].y_px, blobs[j].extent_px) for j in matched])
+        lone = [i for i in range(len(tracks)) if blob_of[i] < 0]
+        while lone:  # ascending; a younger track that loses its blob joins the end
+            i = lone.pop(0)
+            x, y = tracks[i].position_at(t_hop_ns)
+            distance = np.hypot(seen[:, 0] - x, seen[:, 1] - y) - seen[:, 2]
+            nearest = int(np.argmin(distance))
+            if distance[nearest] > 0:
+                continue
+            j = matched[nearest]
+            if track_of[j] > i:
+                younger = track_of[j]
+                blob_of[younger], blob_of[i], track_of[j] = -1, j, i
+                lone.append(younger)
+            else:
+                covering[i] = j
+        return covering
+
+    def _ended(self, track: Track, t_hop_ns: int) -> bool:
+        if track.quiet and t_hop_ns - track.last_seen_ns >= self._lost_after_ns:
+            return True
+        since = track.covered_since_ns
+        return since is not None and t_hop_ns - since >= self._merge_after_ns
+
+    def _begin(
+        self,
+        tracks: list[Track],
+        blobs: Sequence[Blob],
+        blob_of: list[int],
+        track_of: list[int],
+        t_hop_ns: int,
+    ) -> tuple[tuple[Track, ...], tuple[int, ...], int]:
+        """Begin tracks with the blobs that are left, but not with pieces of a blob that is followed already."""
+        left = [j for j in range(len(blobs)) if track_of[j] < 0]
+        seen = [tracks[i] for i in range(len(tracks)) if blob_of[i] >= 0]
+        if left and seen:
+            centres = np.array([(*track.position_at(t_hop_ns), track.extent_px) for track in seen])
+            left = [j for j in left if not _inside(blobs[j], centres)]
+        left.sort(key=lambda j: (-blobs[j].index, -blobs[j].event_count, j))
+        room = max(0, self._parameters.max_tracks - len(self._tracks))
+        new = tuple(self._new_track(blobs[j], t_hop_ns) for j in left[:room])
+        return new, tuple(left[:room]), max(0, len(left) - room)
+
+    def _new_track(self, blob: Blob, t_hop_ns: int) -> Track:
+        variance = (blob.variance_px2 + _FLOOR_PX**2, 0.0, _FIRST_SPEED_PX_PER_S**2)
+        track = Track(
+            self._next_id, blob.x_px, blob.y_px, blob.t_ns, blob.extent_px, blob.index, blob.t_ns, blob.t_ns,
+            matched_ns=t_hop_ns, variance=variance,
+        )  # fmt: skip
+        self._tracks[track.track_id] = track
+        self._next_id += 1
+        return track
+
+
+def _take(track: Track, blob: Blob, t_hop_ns: int) -> None:
+    """Let a track take its blob; one without new events is seen, but tells nothing new about the position."""
+    if blob.fresh:
+        track.observe(blob.x_px, blob.y_px, blob.t_ns, blob.variance_px2 + _FLOOR_PX**2)
+        track.last_seen_ns = blob.t_ns
+    gain = _EXTENT_RISE if blob.extent_px > track.extent_px else _EXTENT_FALL
+    track.extent_px += gain * (blob.extent_px - track.extent_px)
+    track.index = blob.index
+    track.quiet = False
+    track.matched_ns = t_hop_ns
+    track.covered_since_ns = None
+
+
+def _miss(track: Track, covered: bool, t_hop_ns: int) -> None:
+    if not track.quiet:
+        track.fall_quiet()
+    if not covered:
+        track.covered_since_ns = None
+    elif track.covered_since_ns is None:
+        track.covered_since_ns = t_hop_ns
+
+
+def _inside(blob: Blob, centres: np.ndarray) -> bool:
+    """Return whether the blob's centre lies within the extent of one of the tracks."""
+    distance = np.hypot(centres[:, 0] - blob.x_px, centres[:, 1] - blob.y_px)
+    return bool(np.any(distance < centres[:, 2]))
+
+
+def _fading_s(dt_s: float) -> float:
+    if dt_s <= _STEADY_S:
+        return dt_s
+    return _STEADY_S + _FADE_S * (1.0 - math.exp((_STEADY_S - dt_s) / _FADE_S))
+
+
+@njit(cache=True, nogil=True)
+def _pairs(state, seen):  # type: ignore[no-untyped-def]
+    """List the pairs of track and blob within the track's gate, and their squared distances.
+
+    ``state``: x, y at the hop, velocity, gate; ``seen``: x, y, age of the blob (s).
+    """
+    first, second, distance2 = [], [], []
+    for i in range(len(state)):
+        for j in range(len(seen)):
+            dx = seen[j, 0] - (state[i, 0] - state[i, 2] * seen[j, 2])
+            dy = seen[j, 1] - (state[i, 1] - state[i, 3] * seen[j, 2])
+            d2 = dx * dx + dy * dy
+            if d2 <= state[i, 4] ** 2:
+                first.append(i)
+                second.append(j)
+                distance2.append(d2)
+    return np.array(first, np.int64), np.array(second, np.int64), np.array(distance2)
