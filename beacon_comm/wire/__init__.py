@@ -1,0 +1,1 @@
+"""Bytes of event messages to event batches, and back."""
