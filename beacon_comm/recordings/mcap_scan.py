@@ -1,4 +1,4 @@
-"""MCAP read from its beginning, without its index: for files whose end is missing or whose summary is unusable.
+"""MCAP read from its beginning, without its index, which is at the end and missing where a recorder was killed.
 
     magic | opcode8 length64 content | opcode8 length64 content | … | magic
 
@@ -43,19 +43,22 @@ def scan(path: Path) -> Iterator[ScannedMessage]:
     """Yield the messages of all topics in the order of the file.
 
     Raises:
-        ValueError: the file is damaged from here on; the text says how.
+        ValueError: the file is damaged from here on, or, at its end, chunks had to be left out; the text says how.
     """
     types: dict[int, str] = {}
     channels: dict[int, tuple[str, str]] = {}
+    damage: ValueError | None = None
     with path.open('rb') as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise ValueError('not an MCAP file')
         for opcode, content in _records(file):
-            if opcode == _CHUNK:
-                for inner_opcode, inner in _split(_decompressed(content)):
+            try:
+                for inner_opcode, inner in _split(_decompressed(content)) if opcode == _CHUNK else [(opcode, content)]:
                     yield from _message(inner_opcode, inner, types, channels)
-            else:
-                yield from _message(opcode, content, types, channels)
+            except ValueError as error:  # the next record is where this one's length says
+                damage = damage or error
+    if damage is not None:
+        raise damage
 
 
 def _records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
@@ -104,12 +107,13 @@ def _decompressed(content: bytes) -> bytes:
     _, _, size, checksum = _unpack('<QQQI', content, 0)
     compression, at = _text(content, 28)
     records = content[at + 8 :]
-    if compression == 'zstd':
-        records = zstd.decompress(records)
-    elif compression == 'lz4':
-        records = lz4_decompress(records)
-    elif compression:
+    if compression not in ('', 'zstd', 'lz4'):
         raise ValueError(f'chunk compression {compression!r} is not known')
+    try:
+        if compression:
+            records = (zstd.decompress if compression == 'zstd' else lz4_decompress)(records)
+    except (zstd.ZstdError, RuntimeError) as error:
+        raise ValueError(f'a chunk cannot be decompressed ({error})') from error
     if len(records) != size or (checksum and crc32(records) != checksum):
         raise ValueError('a chunk fails its checksum')
     return records

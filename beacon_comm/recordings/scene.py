@@ -12,27 +12,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from beacon_comm.core.errors import ParameterError
 from beacon_comm.core.events import NS_PER_S, EventBatch
-from beacon_comm.recordings.bags import Message
+from beacon_comm.recordings.storage import Message
 from beacon_comm.recordings.sources import Background, Beacon
 from beacon_comm.wire.cdr import build_event_packet
 from beacon_comm.wire.evt3_encoder import Evt3Encoder
 
 PACKET_PERIOD_S = 0.004
 STAMP_START_NS = 1_700_000_000 * NS_PER_S  # fixed, so that the same scene gives the same bytes
-
-
-class _Events(NamedTuple):
-    x: NDArray[np.uint16]
-    y: NDArray[np.uint16]
-    polarity: NDArray[np.int8]
-    t_ns: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -95,9 +86,8 @@ class Scene:
         for begin_ns in range(start_ns, stop_ns, self.packet_period_ns):
             end_ns = min(begin_ns + self.packet_period_ns, stop_ns)
             until = int(np.searchsorted(beacons.t_ns, end_ns))
-            part = _Events(*(column[at:until] for column in beacons))
-            merged = _merged([part, *background.take_until(end_ns)])
-            yield EventBatch(merged.x, merged.y, merged.polarity, merged.t_ns, end_ns)
+            part = beacons.slice(at, until, end_ns)
+            yield _merged([part, *background.take_until(end_ns)], end_ns)
             at = until
 
     def packets(self, start_s: float = 0.0, duration_s: float | None = None, loop: bool = False) -> Iterator[Message]:
@@ -140,12 +130,12 @@ class Scene:
         start_ns = round(start_s * 1e6) * 1000
         return start_ns, self.end_ns if duration_s is None else start_ns + round(duration_s * 1e6) * 1000
 
-    def _beacon_events(self) -> _Events:
+    def _beacon_events(self) -> EventBatch:
         placed = []
         for index, beacon in enumerate(self.beacons):
             x, y = beacon.disc.pixels(beacon.t_ns, [self.seed, index])
-            placed.append(_Events(x, y, beacon.polarity, beacon.t_ns))
-        return _merged(placed)
+            placed.append(EventBatch(x, y, beacon.polarity, beacon.t_ns, beacon.end_ns))
+        return _merged(placed, self.end_ns)
 
 
 class _Pending:
@@ -153,32 +143,37 @@ class _Pending:
 
     def __init__(self, batches: Iterator[EventBatch]) -> None:
         self._batches = batches
-        self._waiting: list[_Events] = []
+        self._waiting: list[EventBatch] = []
         self._known_ns = -1
         self._exhausted = False
 
-    def take_until(self, t_ns: int) -> list[_Events]:
+    def take_until(self, t_ns: int) -> list[EventBatch]:
         """Return the next events before ``t_ns`` (ns), in order."""
         while not self._exhausted and self._known_ns < t_ns:
             batch = next(self._batches, None)
             if batch is None:
                 self._exhausted = True
                 break
-            self._waiting.append(_Events(batch.x, batch.y, batch.polarity, batch.t_ns))
+            self._waiting.append(batch)
             self._known_ns = int(batch.t_ns[-1])
         taken, kept = [], []
-        for events in self._waiting:
-            split = int(np.searchsorted(events.t_ns, t_ns))
-            taken.append(_Events(*(column[:split] for column in events)))
-            if split < len(events.t_ns):
-                kept.append(_Events(*(column[split:] for column in events)))
+        for batch in self._waiting:
+            split = int(np.searchsorted(batch.t_ns, t_ns))
+            taken.append(batch.slice(0, split, t_ns))
+            if split < len(batch):
+                kept.append(batch.slice(split, len(batch), batch.t_end_ns))
         self._waiting = kept
         return taken
 
 
-def _merged(parts: list[_Events]) -> _Events:
+def _merged(parts: list[EventBatch], t_end_ns: int) -> EventBatch:
     """Merge by time, in whole microseconds, which is what EVT3 carries; at the same time the first part comes first."""
-    together = _Events(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
-    t_ns = together.t_ns // 1000 * 1000
+    t_ns = np.concatenate([part.t_ns for part in parts]) // 1000 * 1000
     order = np.argsort(t_ns, kind='stable')
-    return _Events(together.x[order], together.y[order], together.polarity[order], t_ns[order])
+    return EventBatch(
+        np.concatenate([part.x for part in parts])[order],
+        np.concatenate([part.y for part in parts])[order],
+        np.concatenate([part.polarity for part in parts])[order],
+        t_ns[order],
+        t_end_ns,
+    )

@@ -1,0 +1,276 @@
+"""Reading and writing bags: every form of bag gives the same raw CDR, and damage is named."""
+
+import shutil
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags import rosbag1, rosbag2
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from beacon_comm.core.errors import RecordingError
+from beacon_comm.recordings.bag_writer import BagWriter
+from beacon_comm.recordings.bags import TopicInfo, open_recording
+from beacon_comm.recordings.interfaces import PACKET_TYPE, definition_text, definitions
+from beacon_comm.recordings.ros1 import event_message_to_cdr
+
+TYPE_HASH = 'RIHS01_d6fa176260b1f37e5a40845305315e150a0f18191241eb64f407442aa29844aa'  # of the drivers' EventPacket
+TOPIC = '/event_camera/events'
+MESSAGES = [(1_000 + 4_000 * k, b'\x00\x01\x00\x00' + bytes([k]) * 1500) for k in range(20)]
+
+
+def write_bag(
+    folder: Path,
+    plugin: rosbag2.StoragePlugin = rosbag2.StoragePlugin.MCAP,
+    mode: rosbag2.CompressionMode = rosbag2.CompressionMode.NONE,
+    topics: dict[str, str] | None = None,
+) -> Path:
+    writer = rosbag2.Writer(folder, version=8, storage_plugin=plugin)
+    writer.set_compression(mode, rosbag2.CompressionFormat.ZSTD)
+    with writer:
+        for name, message_type in (topics or {TOPIC: PACKET_TYPE}).items():
+            connection = writer.add_connection(
+                name, message_type, msgdef='#include "this is no definition"', rihs01=TYPE_HASH
+            )
+            for t_ns, cdr in MESSAGES:
+                writer.write(connection, t_ns, cdr)
+    return folder
+
+
+def read(path: Path) -> list[tuple[int, bytes]]:
+    with open_recording(path) as bag:
+        return list(bag.messages(bag.event_topic()))
+
+
+FORMS = [
+    (plugin, mode)
+    for plugin in rosbag2.StoragePlugin
+    for mode in rosbag2.CompressionMode
+    if (plugin, mode) != (rosbag2.StoragePlugin.SQLITE3, rosbag2.CompressionMode.STORAGE)
+]
+
+
+@pytest.mark.parametrize(('plugin', 'mode'), FORMS)
+def test_every_storage_and_compression(
+    tmp_path: Path, plugin: rosbag2.StoragePlugin, mode: rosbag2.CompressionMode
+) -> None:
+    folder = write_bag(tmp_path / 'bag', plugin, mode)
+    assert read(folder) == MESSAGES
+    (storage,) = [file for file in folder.iterdir() if file.name != 'metadata.yaml']
+    assert read(storage) == MESSAGES  # the bare file, compressed or not
+    (folder / 'metadata.yaml').unlink()
+    assert read(folder) == MESSAGES  # a folder without metadata
+
+
+@pytest.mark.parametrize(
+    'metadata', ['', ': [', 'rosbag2_bagfile_information: {relative_file_paths: [renamed_since.mcap]}', '[1, 2]']
+)
+def test_unusable_metadata(tmp_path: Path, metadata: str) -> None:
+    folder = write_bag(tmp_path / 'bag')
+    (folder / 'metadata.yaml').write_text(metadata)
+    assert read(folder) == MESSAGES
+
+
+def test_split_files_come_in_order(tmp_path: Path) -> None:
+    folder = tmp_path / 'split'
+    folder.mkdir()
+    for k in (2, 10, 1):
+        part = write_bag(tmp_path / f'part_{k}')
+        shutil.move(part / f'part_{k}.mcap', folder / f'bag_{k}.mcap')
+        (folder / f'bag_{k}.mcap').touch()
+    with open_recording(folder) as bag:
+        assert bag.topics() == [TopicInfo(TOPIC, PACKET_TYPE, 60)]
+        assert list(bag.messages(TOPIC)) == MESSAGES * 3
+        assert [file.name for file in bag._files] == ['bag_1.mcap', 'bag_2.mcap', 'bag_10.mcap']
+    (folder / 'metadata.yaml').write_text(
+        'rosbag2_bagfile_information: {relative_file_paths: [bag_2.mcap, bag_3.mcap]}'
+    )
+    with open_recording(folder) as bag:
+        kept = []
+        with pytest.raises(RecordingError, match=r'bag_3\.mcap: listed in metadata\.yaml, but missing'):
+            kept.extend(bag.messages(TOPIC))  # extend keeps what came before the error
+        assert kept == MESSAGES
+
+
+def test_the_topic_is_chosen_or_the_choice_is_listed(tmp_path: Path) -> None:
+    two = write_bag(tmp_path / 'two', topics={'/left': PACKET_TYPE, '/right': PACKET_TYPE, '/t': 'std_msgs/msg/Int8'})
+    with open_recording(two) as bag:
+        assert bag.event_topic('/right').name == '/right'
+        with pytest.raises(RecordingError, match=r'several event topics, choose one .*/left .*/right'):
+            bag.event_topic()
+        for name in ('/absent', '/t'):
+            with pytest.raises(RecordingError, match=rf'no event topic {name} \(the bag holds /left'):
+                bag.event_topic(name)
+    bag = open_recording(write_bag(tmp_path / 'none', topics={'/t': 'std_msgs/msg/Int8'}))
+    with pytest.raises(RecordingError, match=r'no event topic \(the bag holds /t \(std_msgs/msg/Int8, 20\)\)'):
+        bag.event_topic()
+
+
+@pytest.mark.parametrize('size', [0.3, 0.9, 0.999])
+def test_a_cut_mcap_gives_what_is_left_and_says_so(tmp_path: Path, size: float) -> None:
+    folder = write_bag(tmp_path / 'bag')
+    file = folder / 'bag.mcap'
+    # The writer puts one chunk; messages outside of chunks are what a recorder without chunks leaves.
+    whole = file.read_bytes()
+    records = whole[:8] + _unchunked(whole)
+    file.write_bytes(records[: int(len(records) * size)])
+    with open_recording(folder) as bag:
+        kept = []
+        with pytest.raises(RecordingError, match=r'bag\.mcap: the file ends'):
+            kept.extend(bag.messages(TOPIC))
+    assert kept == MESSAGES[: len(kept)] and len(kept) >= int(20 * size) - 2
+
+
+def _unchunked(mcap: bytes) -> bytes:
+    out, at = b'', 8
+    while at < len(mcap) - 8:
+        opcode, length = struct.unpack_from('<BQ', mcap, at)
+        content = mcap[at + 9 : at + 9 + length]
+        at += 9 + length
+        if opcode == 6:
+            (name_length,) = struct.unpack_from('<I', content, 28)
+            out += content[32 + name_length + 8 :]
+        elif opcode in (1, 3, 4, 5):
+            out += struct.pack('<BQ', opcode, length) + content
+    return out
+
+
+@pytest.mark.parametrize('plugin', rosbag2.StoragePlugin)
+def test_damage_within_a_file_keeps_what_is_before(tmp_path: Path, plugin: rosbag2.StoragePlugin) -> None:
+    folder = write_bag(tmp_path / 'bag', plugin)
+    file = folder / f'bag.{"mcap" if plugin is rosbag2.StoragePlugin.MCAP else "db3"}'
+    content = bytearray(file.read_bytes())
+    at = content.find(MESSAGES[10][1])  # storage is in order of writing
+    content[at - 400 : at + 400] = b'\xff' * 800
+    file.write_bytes(content)
+    with open_recording(folder) as bag:
+        kept: list[tuple[int, bytes]] = []
+        with pytest.raises(RecordingError, match=rf'{file.name}: '):
+            kept.extend(bag.messages(TOPIC))
+    assert 6 <= len(kept) < 20
+    assert kept[:6] == MESSAGES[:6]
+
+
+def test_a_destroyed_head_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / 'a.db3'
+    file.write_bytes(bytes(5000))
+    with pytest.raises(RecordingError, match=r'a\.db3: file is not a database'):
+        open_recording(file)
+    ros1 = tmp_path / 'cut.bag'
+    ros1.write_bytes(b'#ROSBAG V2.0\n' + bytes(50))
+    with pytest.raises(RecordingError, match=r'cut\.bag: '):
+        open_recording(ros1)
+
+
+def test_what_is_no_bag_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match='no such file or folder'):
+        open_recording(tmp_path / 'absent')
+    (tmp_path / 'a.txt').write_text('text')
+    with pytest.raises(RecordingError, match=r'a\.txt: not a bag'):
+        open_recording(tmp_path / 'a.txt')
+    (tmp_path / 'empty').mkdir()
+    with pytest.raises(RecordingError, match=r'no \.mcap or \.db3 file'):
+        open_recording(tmp_path / 'empty')
+    (tmp_path / 'a.mcap').write_bytes(b'no mcap either')
+    with pytest.raises(RecordingError, match=r'a\.mcap: not an MCAP file'):
+        open_recording(tmp_path / 'a.mcap')
+    (tmp_path / 'a.mcap.zstd').write_bytes(b'not compressed')
+    with pytest.raises(RecordingError, match=r'a\.mcap\.zstd: '):
+        open_recording(tmp_path / 'a.mcap.zstd')
+
+
+def test_written_bags_read_back_everywhere(tmp_path: Path) -> None:
+    folder = tmp_path / 'deep' / 'out'
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for name, text in definitions(PACKET_TYPE).items():
+        if name not in store.types:
+            store.register(get_types_from_msg(text, name))
+    header = store.types['std_msgs/msg/Header'](store.types['builtin_interfaces/msg/Time'](5, 6), 'camera')
+    packet = store.types[PACKET_TYPE](header, 480, 640, 7, 0, 'evt3', False, np.arange(9, dtype=np.uint8))
+    cdr = bytes(store.serialize_cdr(packet, PACKET_TYPE))
+    with BagWriter(folder) as writer:
+        writer.add_topic(TOPIC, PACKET_TYPE)
+        writer.write(TOPIC, 123, cdr)
+    assert read(folder) == [(123, cdr)]
+    with AnyReader([folder]) as reader:
+        ((connection, t_ns, raw),) = reader.messages()
+        assert (connection.digest, t_ns) == (TYPE_HASH, 123)
+        message = reader.deserialize(raw, connection.msgtype)
+        assert (message.width, message.seq, message.encoding) == (640, 7, 'evt3')
+    with pytest.raises(RecordingError, match='exists already, nothing is overwritten'):
+        BagWriter(folder)
+    with BagWriter(tmp_path / 'other') as writer, pytest.raises(RecordingError, match='no definition of std_msgs'):
+        writer.add_topic('/t', 'std_msgs/msg/Int8')
+
+
+@pytest.mark.parametrize('count', [0, 1, 2, 5])
+@pytest.mark.parametrize('frame_id', ['', 'cam', 'four'])
+def test_ros1_messages_become_cdr(count: int, frame_id: str) -> None:
+    """The conversion of our own gives what rosbags' general, slower one gives."""
+    for message_type in (PACKET_TYPE, 'dvs_msgs/msg/EventArray'):
+        store = get_typestore(Stores.ROS1_NOETIC)
+        for name, text in definitions(message_type).items():
+            if name not in store.types:
+                store.register(get_types_from_msg(text, name))
+        types = store.types
+        time = types['builtin_interfaces/msg/Time']
+        header = types['std_msgs/msg/Header'](9, time(5, 6), frame_id)
+        if message_type == PACKET_TYPE:
+            content = np.arange(count, dtype=np.uint8)
+            message = types[message_type](header, 480, 640, 7, 2**40, 'mono', False, content)
+        else:
+            event = types['dvs_msgs/msg/Event']
+            events = [event(k, 100 + k, time(7, 8 + k), bool(k % 2)) for k in range(count)]
+            message = types[message_type](header, 480, 640, events)
+        raw = bytes(store.serialize_ros1(message, message_type))
+        modern = get_typestore(Stores.ROS2_JAZZY)
+        for name, text in definitions(message_type).items():
+            if name not in modern.types:
+                modern.register(get_types_from_msg(text, name))
+        converted = event_message_to_cdr(raw, message_type)
+        back = modern.deserialize_cdr(converted, message_type)
+        assert bytes(modern.serialize_cdr(back, message_type)) == converted
+        assert (back.header.stamp.sec, back.header.frame_id, back.height) == (5, frame_id, 480)
+        if message_type == PACKET_TYPE:
+            assert (back.seq, back.time_base, back.encoding) == (7, 2**40, 'mono')
+            assert back.events.tolist() == list(range(count))
+        else:
+            assert [(e.x, e.y, e.ts.sec, e.ts.nanosec, e.polarity) for e in back.events] == [
+                (e.x, e.y, e.ts.sec, e.ts.nanosec, e.polarity) for e in message.events
+            ]
+        with pytest.raises((ValueError, struct.error)):
+            event_message_to_cdr(raw[:-1] if count else raw[:-4], message_type)
+
+
+def test_a_ros1_bag(tmp_path: Path) -> None:
+    raw = struct.pack('<IIII', 0, 5, 6, 0) + struct.pack('<II', 480, 640) + struct.pack('<QQ', 1, 2)
+    raw += struct.pack('<I', 4) + b'evt3' + b'\x00' + struct.pack('<I', 3) + b'abc'
+    with rosbag1.Writer(tmp_path / 'one.bag') as writer:
+        connection = writer.add_connection(
+            TOPIC, PACKET_TYPE, msgdef=definition_text(PACKET_TYPE), md5sum='0123456789abcdef0123456789abcdef'
+        )
+        writer.write(connection, 77, raw)
+    with open_recording(tmp_path / 'one.bag') as bag:
+        assert bag.event_topic() == TopicInfo(TOPIC, PACKET_TYPE, 1)
+    assert read(tmp_path / 'one.bag') == [(77, event_message_to_cdr(raw, PACKET_TYPE))]
+
+
+@pytest.mark.parametrize(
+    ('name', 'message_type', 'count'),
+    [
+        ('evt3_static', PACKET_TYPE, 517),
+        ('libcaer_grid', PACKET_TYPE, 100),
+        ('evt3_trigger_hd', PACKET_TYPE, 105),
+        ('mono_legacy', 'event_array_msgs/msg/EventArray', 2),
+    ],
+)
+def test_real_bags(data_folder: Path, name: str, message_type: str, count: int) -> None:
+    with open_recording(data_folder / name) as bag:
+        assert bag.topics() == [TopicInfo(TOPIC, message_type, count)]
+        messages = list(bag.messages(TOPIC))
+    assert len(messages) == count
+    assert all(cdr[:2] == b'\x00\x01' for _, cdr in messages)
+    times = [t_ns for t_ns, _ in messages]
+    assert times == sorted(times)
