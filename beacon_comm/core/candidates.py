@@ -21,14 +21,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beacon_comm.core.character import Character
 from beacon_comm.core.confirmation import ParityRecord
+from beacon_comm.core.demodulator import Demodulator
 from beacon_comm.core.parameters import Parameters
+from beacon_comm.core.routing import Routed
+from beacon_comm.core.tracks import Track
 
 Times = NDArray[np.int64]
 Polarities = NDArray[np.int8]
@@ -39,13 +41,13 @@ class BeaconState(IntEnum):
     """State of a track; the numbers are those of ``msg/Beacon.msg``."""
 
     WAITING = 0
-    """Candidate that has not had a demodulator yet."""
+    """Candidate without a demodulator: it has not had its turn, or that ended undecided."""
     DEMODULATING = 1
     """Candidate with a demodulator."""
     CONFIRMED = 2
     """Parity has vouched for it."""
     DEMOTED = 3
-    """It has had its turn, or parity has failed it; at the back of the queue."""
+    """Parity has failed it, or there were too few characters; at the back of the queue."""
     LOST = 4
     """Unseen past lost_after_s."""
 
@@ -58,51 +60,9 @@ class ReceivedCharacter:
     character: Character
 
 
-class SlotDemodulator(Protocol):
-    """What a slot asks of a demodulator; see :mod:`beacon_comm.core.demodulator`."""
-
-    @property
-    def bit_rate_bps(self) -> float | None:
-        """Settled bit rate (bit/s), None before."""
-
-    def push(self, t_ns: Times, polarity: Polarities, t_end_ns: int) -> list[Character]:
-        """Take events (ns; ±1) and the time up to which the stream is known (ns); return the finished characters."""
-
-    def flush(self) -> list[Character]:
-        """Return the characters still held back, as if nothing came any more."""
-
-
-class Candidate(Protocol):
-    """What the queue asks of a track; see :mod:`beacon_comm.core.tracks`."""
-
-    @property
-    def index(self) -> float:
-        """The paper's index I."""
-
-    @property
-    def quiet(self) -> bool:
-        """No events now."""
-
-
-class TrackEvents(Protocol):
-    """Events of one track; see :mod:`beacon_comm.core.routing`."""
-
-    @property
-    def track_id(self) -> int:
-        """Label of the track."""
-
-    @property
-    def t_ns(self) -> Times:
-        """Sensor time (ns), ``(n,)`` int64."""
-
-    @property
-    def polarity(self) -> Polarities:
-        """±1, ``(n,)`` int8."""
-
-
 @dataclass(slots=True)
 class _Slot:
-    demodulator: SlotDemodulator
+    demodulator: Demodulator
     record: ParityRecord
 
 
@@ -126,14 +86,14 @@ class CandidateSlots:
         make_demodulator: called once for each slot that is given.
     """
 
-    def __init__(self, parameters: Parameters, make_demodulator: Callable[[Parameters], SlotDemodulator]) -> None:
+    def __init__(self, parameters: Parameters, make_demodulator: Callable[[Parameters], Demodulator]) -> None:
         self._p = parameters
         self._make_demodulator = make_demodulator
         self._slots: dict[int, _Slot] = {}
         self._tried: dict[int, _Tried] = {}
         self._slots_full = False
 
-    def assign(self, tracks: Mapping[int, Candidate], t_ns: int, backlog: Backlog) -> list[ReceivedCharacter]:
+    def assign(self, tracks: Mapping[int, Track], t_ns: int, backlog: Backlog) -> list[ReceivedCharacter]:
         """Free the slots of demoted tracks and give free ones to the queue.
 
         To be called at each point of the hop grid, when every slot has been demodulated up to it.
@@ -161,7 +121,7 @@ class CandidateSlots:
             received += self._give(track_id, t_ns, *backlog(track_id))
         return sorted(received, key=_by_time)
 
-    def demodulate(self, routed: Iterable[TrackEvents], t_end_ns: int) -> list[ReceivedCharacter]:
+    def demodulate(self, routed: Iterable[Routed], t_end_ns: int) -> list[ReceivedCharacter]:
         """Hand the slots their events, and time to those without, so that a silence ends a character.
 
         Args:
@@ -203,12 +163,14 @@ class CandidateSlots:
         return tuple(sorted(track_id for track_id, slot in self._slots.items() if slot.record.confirmed))
 
     def state(self, track_id: int) -> BeaconState:
-        """Return a track's state; WAITING for one that never had a slot (LOST is for the receiver to say)."""
+        """Return a track's state; WAITING for one it has not heard of (that a track is LOST is for others to say)."""
         record = self.record(track_id)
         if record is None:
             return BeaconState.WAITING
-        if track_id not in self._slots or record.demoted:
+        if record.demoted:
             return BeaconState.DEMOTED
+        if track_id not in self._slots:
+            return BeaconState.WAITING
         return BeaconState.CONFIRMED if record.confirmed else BeaconState.DEMODULATING
 
     def record(self, track_id: int) -> ParityRecord | None:
@@ -233,7 +195,7 @@ class CandidateSlots:
         for_candidates = max(self._p.candidate_slots - confirmed, self._p.reserved_candidate_slots)
         return for_candidates - (len(self._slots) - confirmed)
 
-    def _queue(self, tracks: Mapping[int, Candidate]) -> list[int]:
+    def _queue(self, tracks: Mapping[int, Track]) -> list[int]:
         def place(track_id: int) -> tuple[int, float, int]:
             tried = self._tried.get(track_id)
             return (0, -tracks[track_id].index, track_id) if tried is None else (1, tried.ended_ns, track_id)

@@ -1,22 +1,34 @@
-"""Confirmation by parity: whether what a demodulator reads is a beacon (the paper's section III, "Detection algorithm").
+"""Confirmation by parity: whether what a demodulator reads is a beacon (section III, "Detection algorithm").
 
-A candidate's *counted* characters are those its demodulator gives out (a silence gives none).  Three rules look at
-them, each at the end of the record, so that a late verdict costs no more memory than an early one::
+Every character that a demodulator gives out is *counted* (a silence gives none).  Three rules look at them::
 
-    counted characters   1 ...................15 .................30 ......
-    reject (the paper)              last 5 |#####|         last 5 |#####|     at the 15th and every 15 after
-    confirm (ours)       |###############|  last 15, at every character from the 15th on
-    demote (the paper)   a confirmed beacon's last 5, at every character; 15 failures in a row
+    counted characters    1 ................... 15 ................ 30 ......
+    reject (the paper)               last 5 |#####|        last 5 |#####|      at the 15th and at every 15th after
+    confirm (ours)         |###################|  last 15                      at every character from the 15th on
+    demote (the paper)     a confirmed beacon: the last 5, at every character; demoted at 15 failures in a row
+
+A lamp is a valid sender, too: at each of its falls the same waveform lies ahead, so every character is synchronised
+and reads alike, with right parity if chance has it; an edge near the middle of a bit makes several codes of one.
+A line that changes at random gets one character in five ok.  So a character *vouches* for a beacon only if it is ok
+and did not slip in (see :meth:`ParityRecord.push`), and the codes that vouch have to vary as a text's do
+(:func:`repeats`, :func:`regular_share`).  ``docs/confirmation.md`` works out what is left to chance.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import Enum
+from functools import lru_cache
 
 from beacon_comm.core.character import Character, Status
 from beacon_comm.core.events import NS_PER_S
+from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.parameters import Parameters
+
+SLIPPED_BITS = 0.5
+"""A character that starts so many bits too early has slipped: the line was not synchronised before it."""
 
 
 class Verdict(Enum):
@@ -29,18 +41,28 @@ class Verdict(Enum):
     DEMOTED = 'parity has failed the confirmed beacon'
 
 
+@dataclass(frozen=True, slots=True)
+class _Counted:
+    """What the window keeps of a character."""
+
+    code: int
+    frame: int
+    vouches: bool
+
+
 class ParityRecord:
     """Judges one track by its characters since its slot was given.
 
     ========== ============================================================================== =========
     state      when                                                                           becomes
     ========== ============================================================================== =========
-    candidate  every ``judged_characters`` counted: < ``judged_right`` of ``judged_last``     demoted
-               parities right (REJECTED)
+    candidate  every ``judged_characters`` counted: < ``judged_right`` of the last            demoted
+               ``judged_last`` parities right (REJECTED)
     candidate  fewer than ``judged_characters`` counted since the last judgement within       demoted
                ``starved_after_ns`` of time with events (STARVED)
-    candidate  ``confirm_ok`` of the last ``confirm_window`` are ok, and they vary as text    confirmed
-               does (CONFIRMED), unless it is rejected by the same character
+    candidate  ``confirm_ok`` of the last ``confirm_window`` vouch, with                      confirmed
+               ``confirm_distinct_codes`` codes that vary as a text's (CONFIRMED), unless
+               the same character rejects it
     confirmed  ``judged_characters`` in a row, at each of which < ``judged_right`` of the     demoted
                last ``judged_last`` parities were right (DEMOTED)
     confirmed  not one counted character within ``starved_after_ns`` of time with events      demoted
@@ -49,19 +71,19 @@ class ParityRecord:
     ========== ============================================================================== =========
 
     With parity 'none' the status OK stands in for a right parity.  A REPAIRED character is neither ok nor right: the
-    frame's structure that rescued it would have rescued noise as well.
+    structure that rescued it would have rescued noise as well.
 
     Attributes:
         characters, ok, repaired, parity_errors, framing_errors: counted characters since the slot was given.
-        confirmed, demoted: the state; neither is a candidate.
+        confirmed, demoted: the state; a candidate is neither.
         confirmed_at_ns: end of the character that confirmed it (ns, sensor clock), None before.
-        starved_after_ns: see the table (ns); at the slowest listed rate a steady sender never starves.
+        starved_after_ns: see the table (ns); long enough for a steady sender at the slowest listed rate.
     """
 
     def __init__(self, parameters: Parameters) -> None:
         self._p = parameters
-        self._frame_bits = 1 + parameters.data_bits + (parameters.parity != 'none') + parameters.stop_bits
-        judged_s = parameters.judged_characters * self._frame_bits * parameters.slowest_bit_s
+        self._layout = CharacterFrame.from_parameters(parameters)
+        judged_s = parameters.judged_characters * self._layout.length * parameters.slowest_bit_s
         self.starved_after_ns = round(max(parameters.starved_after_s, parameters.starved_margin * judged_s) * NS_PER_S)
         self.characters = 0
         self.ok = 0
@@ -72,13 +94,18 @@ class ParityRecord:
         self.demoted = False
         self.confirmed_at_ns: int | None = None
         self._rights: deque[bool] = deque(maxlen=parameters.judged_last)
-        self._window: deque[Character] = deque(maxlen=parameters.confirm_window)
+        self._window: deque[_Counted] = deque(maxlen=parameters.confirm_window)
+        self._last_start_ns: int | None = None
         self._failures = 0  # characters in a row at which the last parities failed a confirmed beacon
         self._hungry_ns = 0
         self._known_ns: int | None = None
 
     def push(self, character: Character) -> Verdict:
-        """Count a character, in order of time; a demoted record counts on, but gives no further verdict."""
+        """Count a character, in order of time; a demoted record counts on, but gives no further verdict.
+
+        An ok character vouches unless it started more than half a bit early: a synchronised line brings characters a
+        whole frame apart, or further when it idles.
+        """
         self._count(character)
         if self.demoted:
             return Verdict.NONE
@@ -92,12 +119,12 @@ class ParityRecord:
         if self._vouched_for():
             self.confirmed = True
             self._hungry_ns = 0
-            self.confirmed_at_ns = character.t_ns + round(self._frame_bits * NS_PER_S / character.bit_rate_bps)
+            self.confirmed_at_ns = character.t_ns + round(self._layout.duration_ns(character.bit_rate_bps))
             return Verdict.CONFIRMED
         return Verdict.NONE
 
     def advance(self, t_ns: int, quiet: bool) -> Verdict:
-        """Move the record's time on; the time since the last call counts towards starving unless the track is quiet.
+        """Move the record's time on; what passed since the last call counts towards starving, but not if it was quiet.
 
         Args:
             t_ns: stream time (ns); the first call only starts the clock.
@@ -119,9 +146,18 @@ class ParityRecord:
         self.repaired += status is Status.REPAIRED
         self.parity_errors += status is Status.PARITY_ERROR
         self.framing_errors += status is Status.FRAMING_ERROR
-        right = status is Status.OK or (status is Status.FRAMING_ERROR and self._p.parity != 'none')
-        self._rights.append(right)
-        self._window.append(character)
+        self._rights.append(
+            status is Status.OK or (status is Status.FRAMING_ERROR and self._layout.parity_bits > 0)
+        )
+        vouches = status is Status.OK and not self._slipped(character)
+        self._window.append(_Counted(character.code, character.frame, vouches))
+        self._last_start_ns = character.t_ns
+
+    def _slipped(self, character: Character) -> bool:
+        if self._last_start_ns is None:
+            return False
+        bits = (character.t_ns - self._last_start_ns) * character.bit_rate_bps / NS_PER_S
+        return bits < self._layout.length - SLIPPED_BITS
 
     @property
     def _failing(self) -> bool:
@@ -138,21 +174,58 @@ class ParityRecord:
 
     def _vouched_for(self) -> bool:
         p = self._p
-        if len(self._window) < p.confirm_window:
+        vouching = [counted for counted in self._window if counted.vouches]
+        if len(self._window) < p.confirm_window or len(vouching) < p.confirm_ok:
             return False
-        codes = [character.code for character in self._window if character.status is Status.OK]
-        if len(codes) < p.confirm_ok or len(set(codes)) < p.confirm_distinct_codes:
+        if len({counted.code for counted in vouching}) < p.confirm_distinct_codes:
             return False
-        return p.allow_periodic or not any(
-            repeats(tuple(self._window), period, p.confirm_repeats) for period in range(1, p.confirm_period + 1)
+        if p.allow_periodic:
+            return True
+        codes = [counted.code if counted.vouches else None for counted in self._window]
+        return (
+            not any(repeats(codes, period, p.confirm_repeats) for period in range(1, p.confirm_period + 1))
+            and regular_share([counted.frame for counted in vouching], self._layout.length) <= p.confirm_regular
         )
 
 
-def repeats(characters: tuple[Character, ...], period: int, share: float) -> bool:
-    """Return whether the ok characters repeat: more than ``share`` of the ok pairs ``period`` apart are equal."""
+def repeats(codes: Sequence[int | None], period: int, share: float) -> bool:
+    """Return whether more than ``share`` of the pairs of codes ``period`` apart are equal.
+
+    Args:
+        codes: codes in order, None for a character that does not vouch: a pair needs both.
+        period: distance in characters.
+        share: 0 to 1.  Pairs and not positions, because a slip of the stream spoils few pairs but shifts all positions.
+    """
     pairs = [
-        early.code == late.code
-        for early, late in zip(characters, characters[period:], strict=False)
-        if early.status is Status.OK and late.status is Status.OK
+        early == late
+        for early, late in zip(codes, codes[period:], strict=False)
+        if early is not None and late is not None
     ]
-    return bool(pairs) and sum(pairs) > share * len(pairs)
+    return sum(pairs) > share * len(pairs)
+
+
+def regular_share(frames: Sequence[int], length: int) -> float:
+    """Return the share of frames that one lamp could have sent: all falls at one spacing.
+
+    A lamp falls once a period, so the falls in its frames, and the fall that ends a frame, are a period apart, read
+    as m or m + 1 bits; the m is looked for that explains most frames.  A text's falls have all spacings.
+
+    Args:
+        frames: frames as read (first sent bit most significant).
+        length: bits of a frame.
+    """
+    if not frames:
+        return 0.0
+    spacings = [_fall_spacings(frame, length) for frame in frames]
+    return max(
+        sum(shortest >= m and longest <= m + 1 for shortest, longest in spacings) for m in range(2, length + 1)
+    ) / len(frames)
+
+
+@lru_cache(maxsize=4096)
+def _fall_spacings(frame: int, length: int) -> tuple[int, int]:
+    """Return the shortest and the longest spacing (bit) of a frame's falls: its start, those within, its end."""
+    bits = [frame >> shift & 1 for shift in range(length - 1, -1, -1)]
+    falls = [0, *(k for k in range(1, length) if bits[k - 1] and not bits[k]), length]
+    spacings = [late - early for early, late in zip(falls, falls[1:], strict=False)]
+    return min(spacings), max(spacings)
