@@ -17,7 +17,6 @@ too, if they are spread less than all events on the blob's pixels, which a movin
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,8 +42,8 @@ from beacon_comm.core.nearest import CELL_SHIFT, cell_lists, cells_along
 from beacon_comm.core.parameters import Parameters
 
 _FRESH_EVENTS = 4  # fewer new events say nothing about the position …
-_SPREAD_EVENTS = 30  # … and fewer nothing about the extent
-_MOMENTS = [COUNT, COUNT_X, COUNT_Y, COUNT_RR]
+_FRESH_SHARE = 0.1  # … nor does less than this share of its mean: a held LED in front of a moving background
+_SPREAD_EVENTS = 30  # fewer new events say nothing about the extent
 _AS_ACTIVE = 0.5  # share of the events a pixel that makes another pixel "about as active"
 
 
@@ -61,6 +60,7 @@ class Blob:
         event_count: events on its pixels in the window.
         area_px: its pixels.
         fresh_count: events of the newest hop.
+        fresh: whether these are enough for an observation.
         window: which window it was seen in, 0: short.
     """
 
@@ -72,28 +72,13 @@ class Blob:
     event_count: int
     area_px: int
     fresh_count: int
+    fresh: bool
     window: int
-
-    @property
-    def fresh(self) -> bool:
-        """Whether the newest hop held enough events of it for an observation."""
-        return self.fresh_count >= _FRESH_EVENTS
 
     @property
     def variance_px2(self) -> float:
         """Variance of the centre (px²), one axis: that of the mean of events spread over a disc."""
         return self.extent_px**2 / (4.0 * max(1, self.fresh_count if self.fresh else self.event_count))
-
-
-@dataclass(frozen=True, slots=True)
-class _Seen:
-    """A component that stands as a blob."""
-
-    window: int
-    component: int
-    x_px: float
-    y_px: float
-    extent_px: float
 
 
 class BlobFinder:
@@ -113,95 +98,116 @@ class BlobFinder:
         self._size = sensor_size
         self._hop_ns = hop_length_ns(parameters)
         self._finders = [ComponentFinder(parameters, sensor_size) for _ in range(2)]
+        self._sets: list[ComponentSet] = []
         self.owner = np.zeros(sensor_size[0] * sensor_size[1], np.int32)
-        self._owned: list[NDArray[np.int32]] = []
 
     def find(self, images: IndexImages, t_hop_ns: int) -> list[Blob]:
         """Return the blobs at the hop that ends at ``t_hop_ns`` (ns)."""
-        for pixels in self._owned:
-            self.owner[pixels] = 0
-        self._owned = []
+        for components in self._sets:
+            self.owner[components.pixel[: components.first[-1]]] = 0
+        self._sets = []
         if images.empty:
             return []
-        sets = [finder.find(window) for finder, window in zip(self._finders, images.windows, strict=False)]
-        seen = self._choose(sets, images.windows)
-        if not seen:
+        self._sets = [f.find(window) for f, window in zip(self._finders, images.windows, strict=False)]
+        standing = self._choose(images.windows)
+        window = np.repeat(np.arange(len(standing)), [len(numbers) for numbers in standing])
+        if len(window) == 0:
             return []
-        for number, blob in enumerate(seen, 1):
-            self._own(sets[blob.window].pixels_of(blob.component), number)
-        sums = self._observe(seen, sets, images.newest, t_hop_ns - self._hop_ns)
-        return [
-            self._blob(blob, sets[blob.window], sums[k], t_hop_ns, images.windows[blob.window].hops)
-            for k, blob in enumerate(seen)
-        ]
+        sums = np.concatenate([s.sums[c] for s, c in zip(self._sets, standing, strict=True)])
+        index = np.concatenate([s.index[c] for s, c in zip(self._sets, standing, strict=True)])
+        length = np.array([w.hops for w in images.windows])[window]
+        return self._blobs(window, sums, index, length, images.newest, t_hop_ns)
 
-    def _choose(self, sets: list[ComponentSet], windows: list[Window]) -> list[_Seen]:
-        """Return the components that stand as blobs: the short window's first."""
-        standing = [self._fits(components) for components in sets]
-        for component in np.flatnonzero(sets[0].sums[:, AREA] > self._parameters.max_area_px):
-            self._own(sets[0].pixels_of(int(component)), -1)
-        if len(sets) > 1:
-            stands = _long_stands(
-                sets[1].pixel, sets[1].first, standing[1], sets[0].label, standing[0], windows[0].counts
-            )
-            standing[1] &= stands
-        return [
-            _Seen(w, int(c), *_centre_and_extent(*(int(v) for v in sets[w].sums[c, _MOMENTS])))
-            for w in range(len(sets))
-            for c in np.flatnonzero(standing[w])
-        ]
-
-    def _fits(self, components: ComponentSet) -> NDArray[np.bool_]:
-        area = components.sums[:, AREA]
+    def _choose(self, windows: list[Window]) -> list[NDArray[np.int64]]:
+        """Return for each window which components stand as blobs, and let them own their pixels."""
         p = self._parameters
-        fits: NDArray[np.bool_] = (
-            (components.sums[:, SEEDS] > 0) & (area >= p.min_area_px) & (area <= p.max_area_px)
-        )
-        return fits
+        stands = [
+            (s.sums[:, SEEDS] > 0) & (s.sums[:, AREA] >= p.min_area_px) & (s.sums[:, AREA] <= p.max_area_px)
+            for s in self._sets
+        ]
+        short = self._sets[0]
+        if len(self._sets) > 1:
+            long = self._sets[1]
+            stands[1] &= _long_stands(
+                long.pixel, long.first, stands[1], short.label, stands[0], windows[0].counts
+            )
+        chosen = [np.flatnonzero(which) for which in stands]
+        number = np.where(short.sums[:, AREA] > p.max_area_px, -1, 0)
+        number[chosen[0]] = np.arange(1, 1 + len(chosen[0]))
+        _own(short.pixel, short.first, number, self.owner)
+        if len(self._sets) > 1:
+            number = np.zeros(len(stands[1]), np.int64)
+            number[chosen[1]] = np.arange(1 + len(chosen[0]), 1 + len(chosen[0]) + len(chosen[1]))
+            _own(long.pixel, long.first, number, self.owner)
+        return chosen
 
-    def _own(self, pixels: NDArray[np.int32], number: int) -> None:
-        pixels = pixels.copy()
-        self.owner[pixels] = number
-        self._owned.append(pixels)
+    def _blobs(
+        self,
+        window: NDArray[np.int64],
+        sums: NDArray[np.int64],
+        index: NDArray[np.float64],
+        length: NDArray[np.int64],
+        newest: HopEvents,
+        t_hop_ns: int,
+    ) -> list[Blob]:
+        """Observe the components that stand; see the module's head."""
+        x, y, extent = _centre_and_extent(*(sums[:, k] for k in (COUNT, COUNT_X, COUNT_Y, COUNT_RR)))
+        n, sum_x, sum_y, sum_rr, sum_t = self._sum_newest(x, y, extent, sums, newest, t_hop_ns - self._hop_ns).T
+        new_x, new_y, spread = _centre_and_extent(np.maximum(n, 1), sum_x, sum_y, sum_rr)
+        fresh = n >= np.maximum(_FRESH_EVENTS, _FRESH_SHARE * sums[:, COUNT] / length)
+        new_t = t_hop_ns - self._hop_ns + sum_t // np.maximum(n, 1)
+        t_ns = np.where(fresh, new_t, t_hop_ns - length * self._hop_ns // 2)
+        x, y = np.where(fresh, new_x, x), np.where(fresh, new_y, y)
+        extent = np.where(fresh & (n >= _SPREAD_EVENTS), np.minimum(extent, spread), extent)
+        columns = (x, y, t_ns, extent, index, sums[:, COUNT], sums[:, AREA], n, fresh, window)
+        return [Blob(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
 
-    def _observe(
-        self, seen: list[_Seen], sets: list[ComponentSet], newest: HopEvents, t_start_ns: int
+    def _sum_newest(
+        self,
+        x: NDArray[np.float64],
+        y: NDArray[np.float64],
+        extent: NDArray[np.float64],
+        sums: NDArray[np.int64],
+        newest: HopEvents,
+        t_start_ns: int,
     ) -> NDArray[np.int64]:
-        """Return for each blob the number of the newest events and the sums of their x, y, t - start, x² + y²."""
+        """Return n, Σx, Σy, Σ(x² + y²), Σ(t - t_start) of each blob's newest events, ``(m, 5)`` int64."""
         p = self._parameters
         width, height = self._size
-        circle = np.array([(blob.x_px, blob.y_px, blob.extent_px) for blob in seen])
-        circle[:, 2] = circle[:, 2] * p.routing_extent_factor + p.routing_margin_px
-        box = np.array([sets[b.window].sums[b.component, [LEFT, RIGHT, TOP, BOTTOM]] for b in seen], np.float64)
-        box[:, 0] = np.minimum(box[:, 0], circle[:, 0] - circle[:, 2])
-        box[:, 1] = np.maximum(box[:, 1], circle[:, 0] + circle[:, 2])
-        box[:, 2] = np.minimum(box[:, 2], circle[:, 1] - circle[:, 2])
-        box[:, 3] = np.maximum(box[:, 3], circle[:, 1] + circle[:, 2])
+        radius = extent * p.routing_extent_factor + p.routing_margin_px
+        box = np.stack(
+            (
+                np.minimum(sums[:, LEFT], x - radius),
+                np.maximum(sums[:, RIGHT], x + radius),
+                np.minimum(sums[:, TOP], y - radius),
+                np.maximum(sums[:, BOTTOM], y + radius),
+            ),
+            axis=1,
+        )
         first, member = cell_lists(box, width, height)
-        sums: NDArray[np.int64] = _sum_newest(
+        circle = np.stack((x, y, radius), axis=1)
+        summed: NDArray[np.int64] = _sum_newest(
             newest.word, newest.t_ns, t_start_ns, width, cells_along(width), first, member, circle, self.owner
         )
-        return sums
-
-    def _blob(
-        self, seen: _Seen, components: ComponentSet, sums: NDArray[np.int64], t_hop_ns: int, hops: int
-    ) -> Blob:
-        c = seen.component
-        x, y, extent, t = seen.x_px, seen.y_px, seen.extent_px, t_hop_ns - hops * self._hop_ns // 2
-        n, sum_x, sum_y, sum_t, sum_rr = (int(value) for value in sums)
-        if n >= _FRESH_EVENTS:
-            x, y, spread = _centre_and_extent(n, sum_x, sum_y, sum_rr)
-            extent = min(extent, spread) if n >= _SPREAD_EVENTS else extent
-            t = t_hop_ns - self._hop_ns + sum_t // n
-        count, area = int(components.sums[c, COUNT]), int(components.sums[c, AREA])
-        return Blob(x, y, t, extent, float(components.index[c]), count, area, n, seen.window)
+        return summed
 
 
-def _centre_and_extent(n: int, sum_x: int, sum_y: int, sum_rr: int) -> tuple[float, float, float]:
-    """Return the centre and the extent (px) of n events by their Σx, Σy, Σ(x² + y²)."""
-    # Exact until the division: the sums are whole numbers, their difference may be small against them.
-    spread2 = (n * sum_rr - sum_x**2 - sum_y**2) / n**2
-    return sum_x / n, sum_y / n, math.sqrt(2.0 * spread2)
+def _centre_and_extent(
+    n: NDArray[np.int64], sum_x: NDArray[np.int64], sum_y: NDArray[np.int64], sum_rr: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return centres and extents (px) of n events by their Σx, Σy, Σ(x² + y²), all ``(m,)``."""
+    x, y = sum_x / n, sum_y / n
+    # Coordinates below 2¹⁶: the difference of squares is good to 10⁻⁵ px².
+    return x, y, np.sqrt(2.0 * np.maximum(sum_rr / n - x * x - y * y, 0.0))
+
+
+@njit(cache=True, nogil=True)
+def _own(pixel, first, number, owner):  # type: ignore[no-untyped-def]
+    """Give every pixel of a component the component's number, unless that is 0."""
+    for c in range(len(number)):
+        if number[c] != 0:
+            for k in range(first[c], first[c + 1]):
+                owner[pixel[k]] = number[c]
 
 
 @njit(cache=True, nogil=True)
@@ -237,7 +243,7 @@ def _long_stands(pixel, first, fits, short_label, short_fits, short_counts):  # 
 def _sum_newest(  # type: ignore[no-untyped-def]
     word, t_ns, t_start_ns, width, cells_across, first, member, circle, owner
 ):
-    """Sum up the newest events of each blob: ``(m, 5)`` int64 of n, Σx, Σy, Σ(t - t_start), Σ(x² + y²)."""
+    """Sum up the newest events of each blob; see :meth:`BlobFinder._sum_newest`."""
     sums = np.zeros((len(circle), 5), np.int64)
     for i in range(len(word)):
         x = np.int64((word[i] >> 2) & 0x3FFF)
@@ -258,6 +264,6 @@ def _sum_newest(  # type: ignore[no-untyped-def]
             sums[b, 0] += 1
             sums[b, 1] += x
             sums[b, 2] += y
-            sums[b, 3] += t_ns[i] - t_start_ns
-            sums[b, 4] += x * x + y * y
+            sums[b, 3] += x * x + y * y
+            sums[b, 4] += t_ns[i] - t_start_ns
     return sums

@@ -185,25 +185,31 @@ class Detector:
         """Begin each new track's buffer with the events on its blob's pixels that are in the blob's window."""
         for track in changes.new:
             self._buffers[track.track_id] = EventBuffer(self._buffer_ns, self._parameters.buffer_max_bytes)
+        begun = dict(zip(changes.new_blobs, changes.new, strict=True))
         for w, window in enumerate(self._images.windows):
-            begun = [(t, b) for t, b in zip(changes.new, changes.new_blobs, strict=True) if blobs[b].window == w]
-            if not begun:
-                continue
             wanted = np.zeros(len(blobs) + 1, np.bool_)
-            wanted[[b + 1 for _, b in begun]] = True
-            for events in self._images.hop_events(window):
-                place, number = _events_on(events.word, self._sensor_size[0], self._blobs.owner, wanted)
-                for track, b in begun:
-                    of = place[number == b + 1]
-                    polarity = np.where(events.word[of] & 1, 1, -1).astype(np.int8)
-                    self._buffers[track.track_id].append(events.t_ns[of], polarity)
+            wanted[[b + 1 for b in begun if blobs[b].window == w]] = True
+            if not wanted.any():
+                continue
+            parts = [
+                _events_on(events.word, events.t_ns, self._sensor_size[0], self._blobs.owner, wanted)
+                for events in self._images.hop_events(window)
+                if len(events)
+            ]
+            number, t_ns, polarity = (np.concatenate(column) for column in zip(*parts, strict=True))
+            order = np.argsort(number, kind='stable')
+            ends = np.cumsum(np.bincount(number, minlength=len(wanted)))
+            for b in np.flatnonzero(wanted):
+                of = order[ends[b - 1] : ends[b]]
+                self._buffers[begun[int(b) - 1].track_id].append(t_ns[of], polarity[of])
 
 
 @njit(cache=True, nogil=True)
-def _events_on(word, width, owner, wanted):  # type: ignore[no-untyped-def]
-    """Return places and blob numbers of the events that no track got and that lie on a wanted blob."""
-    place = np.empty(len(word), np.int64)
+def _events_on(word, t_ns, width, owner, wanted):  # type: ignore[no-untyped-def]
+    """Return blob number, time and polarity of the events that no track got and that lie on a wanted blob."""
     number = np.empty(len(word), np.int32)
+    of_t_ns = np.empty(len(word), np.int64)
+    polarity = np.empty(len(word), np.int8)
     n = 0
     for i in range(len(word)):
         if word[i] & 2:
@@ -212,7 +218,8 @@ def _events_on(word, width, owner, wanted):  # type: ignore[no-untyped-def]
         y = np.int64(word[i] >> 16)
         b = owner[y * width + x]
         if b > 0 and wanted[b]:
-            place[n] = i
             number[n] = b
+            of_t_ns[n] = t_ns[i]
+            polarity[n] = 1 if word[i] & 1 else -1
             n += 1
-    return place[:n], number[:n]
+    return number[:n], of_t_ns[:n], polarity[:n]

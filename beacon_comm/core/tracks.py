@@ -14,11 +14,13 @@ A prediction goes on at constant velocity for a moment and then fades, so that i
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from beacon_comm.core.blobs import Blob
 from beacon_comm.core.events import NS_PER_S
@@ -142,8 +144,9 @@ class Tracker:
         if not blobs and not self._tracks:
             return TrackChanges()
         tracks = list(self._tracks.values())
-        blob_of, track_of = self._associate(tracks, blobs, t_hop_ns)
-        covering = self._covering(tracks, blobs, blob_of, track_of, t_hop_ns)
+        centre = np.array([track.position_at(t_hop_ns) for track in tracks]).reshape(-1, 2)
+        blob_of, track_of = self._associate(tracks, centre, blobs, t_hop_ns)
+        covering = _covering(centre, blobs, blob_of, track_of)
         for i, track in enumerate(tracks):
             if blob_of[i] >= 0:
                 _take(track, blobs[blob_of[i]], t_hop_ns)
@@ -162,20 +165,19 @@ class Tracker:
         return TrackChanges(lost=lost)
 
     def _associate(
-        self, tracks: list[Track], blobs: Sequence[Blob], t_hop_ns: int
+        self, tracks: list[Track], centre: NDArray[np.float64], blobs: Sequence[Blob], t_hop_ns: int
     ) -> tuple[list[int], list[int]]:
         """Return each track's blob and each blob's track, -1 for none: globally nearest pairs first."""
         blob_of, track_of = [-1] * len(tracks), [-1] * len(blobs)
         if not tracks or not blobs:
             return blob_of, track_of
         p = self._parameters
-        state = np.empty((len(tracks), 5))
-        for i, track in enumerate(tracks):
-            unseen_s = max(0, t_hop_ns - track.matched_ns) / NS_PER_S
-            gate = min(p.max_gate_px, p.association_gate_px + p.gate_growth_px_per_s * unseen_s)
-            # The centre of a large blob is uncertain by a share of its size.
-            state[i, :2] = track.position_at(t_hop_ns)
-            state[i, 2:] = track.vx_px_per_s, track.vy_px_per_s, max(gate, track.extent_px)
+        moving = np.array([(t.vx_px_per_s, t.vy_px_per_s, t.extent_px) for t in tracks])
+        unseen_s = np.array([t_hop_ns - track.matched_ns for track in tracks]) / NS_PER_S
+        gate = np.minimum(p.max_gate_px, p.association_gate_px + p.gate_growth_px_per_s * unseen_s)
+        # The centre of a large blob is uncertain by a share of its size.
+        gate = np.maximum(gate, moving[:, 2])
+        state = np.column_stack((centre, moving[:, :2], gate))
         seen = np.array([(blob.x_px, blob.y_px, (t_hop_ns - blob.t_ns) / NS_PER_S) for blob in blobs])
         first, second, distance2 = _pairs(state, seen)
         for k in np.lexsort((second, first, distance2)):
@@ -183,36 +185,6 @@ class Tracker:
             if blob_of[i] < 0 and track_of[j] < 0:
                 blob_of[i], track_of[j] = j, i
         return blob_of, track_of
-
-    @staticmethod
-    def _covering(
-        tracks: list[Track], blobs: Sequence[Blob], blob_of: list[int], track_of: list[int], t_hop_ns: int
-    ) -> list[int]:
-        """Return for each track without a blob the one it lies in, -1 for none.
-
-        An older track takes such a blob over from a younger one: of tracks that merge the older goes on.
-        """
-        covering = [-1] * len(tracks)
-        matched = [j for j in range(len(blobs)) if track_of[j] >= 0]
-        if not matched or all(j >= 0 for j in blob_of):
-            return covering
-        seen = np.array([(blobs[j].x_px, blobs[j].y_px, blobs[j].extent_px) for j in matched])
-        lone = [i for i in range(len(tracks)) if blob_of[i] < 0]
-        while lone:  # ascending; a younger track that loses its blob joins the end
-            i = lone.pop(0)
-            x, y = tracks[i].position_at(t_hop_ns)
-            distance = np.hypot(seen[:, 0] - x, seen[:, 1] - y) - seen[:, 2]
-            nearest = int(np.argmin(distance))
-            if distance[nearest] > 0:
-                continue
-            j = matched[nearest]
-            if track_of[j] > i:
-                younger = track_of[j]
-                blob_of[younger], blob_of[i], track_of[j] = -1, j, i
-                lone.append(younger)
-            else:
-                covering[i] = j
-        return covering
 
     def _ended(self, track: Track, t_hop_ns: int) -> bool:
         if track.quiet and t_hop_ns - track.last_seen_ns >= self._lost_after_ns:
@@ -232,8 +204,9 @@ class Tracker:
         left = [j for j in range(len(blobs)) if track_of[j] < 0]
         seen = [tracks[i] for i in range(len(tracks)) if blob_of[i] >= 0]
         if left and seen:
-            centres = np.array([(*track.position_at(t_hop_ns), track.extent_px) for track in seen])
-            left = [j for j in left if not _inside(blobs[j], centres)]
+            circle = np.array([(*track.position_at(t_hop_ns), track.extent_px) for track in seen])
+            piece_of = _circle_of(np.array([(blobs[j].x_px, blobs[j].y_px) for j in left]), circle)
+            left = [j for j, i in zip(left, piece_of, strict=True) if i < 0]
         left.sort(key=lambda j: (-blobs[j].index, -blobs[j].event_count, j))
         room = max(0, self._parameters.max_tracks - len(self._tracks))
         new = tuple(self._new_track(blobs[j], t_hop_ns) for j in left[:room])
@@ -272,10 +245,32 @@ def _miss(track: Track, covered: bool, t_hop_ns: int) -> None:
         track.covered_since_ns = t_hop_ns
 
 
-def _inside(blob: Blob, centres: np.ndarray) -> bool:
-    """Return whether the blob's centre lies within the extent of one of the tracks."""
-    distance = np.hypot(centres[:, 0] - blob.x_px, centres[:, 1] - blob.y_px)
-    return bool(np.any(distance < centres[:, 2]))
+def _covering(
+    centre: NDArray[np.float64], blobs: Sequence[Blob], blob_of: list[int], track_of: list[int]
+) -> list[int]:
+    """Return for each track without a blob the followed one it lies in, -1 for none.
+
+    An older track takes such a blob over from a younger one: of tracks that merge the older goes on.
+    """
+    covering = [-1] * len(centre)
+    followed = [j for j in range(len(blobs)) if track_of[j] >= 0]
+    if not followed or all(j >= 0 for j in blob_of):
+        return covering
+    circle = np.array([(blobs[j].x_px, blobs[j].y_px, blobs[j].extent_px) for j in followed])
+    within = _circle_of(centre, circle)
+    lone = deque(i for i in range(len(centre)) if blob_of[i] < 0 and within[i] >= 0)
+    while lone:  # oldest first; a younger track that loses its blob joins the end
+        i = lone.popleft()
+        if within[i] < 0:
+            continue
+        j = followed[within[i]]
+        if track_of[j] > i:
+            younger = track_of[j]
+            blob_of[younger], blob_of[i], track_of[j] = -1, j, i
+            lone.append(younger)
+        else:
+            covering[i] = j
+    return covering
 
 
 def _fading_s(dt_s: float) -> float:
@@ -301,3 +296,16 @@ def _pairs(state, seen):  # type: ignore[no-untyped-def]
                 second.append(j)
                 distance2.append(d2)
     return np.array(first, np.int64), np.array(second, np.int64), np.array(distance2)
+
+
+@njit(cache=True, nogil=True)
+def _circle_of(point, circle):  # type: ignore[no-untyped-def]
+    """Return for each point the circle (x, y, radius) it lies deepest in, -1 for none, ``(n,)`` int64."""
+    found = np.full(len(point), -1, np.int64)
+    for i in range(len(point)):
+        deepest = 0.0
+        for j in range(len(circle)):
+            depth = circle[j, 2] - np.hypot(point[i, 0] - circle[j, 0], point[i, 1] - circle[j, 1])
+            if depth > deepest:
+                found[i], deepest = j, depth
+    return found
