@@ -175,12 +175,12 @@ class Parameters(Declared):
     short_window_s: float = parameter(0.02, 'short detection window', 's', 0.001, 1.0)
     long_window_bits: float = parameter(22.0, 'long detection window, in bits of the slowest listed rate', 'bit', 1, 1000)
     index_offset: float = parameter(10.0, 'B of the index I = n / (B + |Σσ|)', 'events', 0.1, 1000.0)
-    index_threshold: float = parameter(1.0, 'a blob has a pixel of at least this index …', '', 0.0)
+    index_threshold: float = parameter(0.6, 'a blob has a pixel of at least this index …', '', 0.0)
     index_grow_share: float = parameter(
         0.5, '… and grows over neighbours above this share of it (1: one threshold, as the paper)', '', 0.1, 1.0
     )
     closing_px: int = parameter(3, 'side of the square of the morphological closing', 'px', 1, 31)
-    min_area_px: int = parameter(4, 'smallest blob', 'px', 1)
+    min_area_px: int = parameter(3, 'smallest blob', 'px', 1)
     max_area_px: int = parameter(10_000, 'largest blob', 'px', 1)
     window_max_bytes: int = parameter(
         256_000_000, 'bound of the events kept for the windows; overflow is counted', 'byte', 1000
