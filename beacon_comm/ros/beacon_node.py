@@ -1,0 +1,287 @@
+"""The node: event messages in, characters, texts, beacons, bearings and confirmations out.
+
+::
+
+    events ──────► on_message ─┐                      ┌─► ~/characters, ~/confirmed    at once
+    (silence) ───► on_tick ────┴► LiveReceiver ► Step ┴─► ~/text, ~/beacons, ~/bearings  at publish_rate_hz
+    camera_info ─► on_camera_info                         /diagnostics                  once a second
+"""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Callable
+from functools import wraps
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.clock import Clock, ClockType, JumpThreshold
+from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import CameraInfo
+
+from beacon_comm.core.errors import CalibrationError
+from beacon_comm.core.events import NS_PER_S
+from beacon_comm.core.receiver import BeaconSnapshot
+from beacon_comm.msg import Beacons, Bearings, Characters, Confirmed, Text
+from beacon_comm.ros import conversions
+from beacon_comm.ros.camera import camera_of_message, load_camera
+from beacon_comm.ros.diagnostics import diagnostics_message
+from beacon_comm.ros.live import LiveReceiver, Step
+from beacon_comm.ros.parameters import read_parameters, unknown_parameters
+from beacon_comm.ros.report import Report
+from beacon_comm.ros.silence import Silence, Situation, why_silent
+from beacon_comm.ros.text import Texts
+from beacon_comm.ros.throttled_log import ThrottledLog
+from beacon_comm.ros.topic import Publishers, choose_type, find_publishers, message_class, similar_topics
+from beacon_comm.ros.warm_up import warm_up
+
+NODE_NAME = 'beacon_node'
+GRAPH_PERIOD_S = 0.25
+REPORT_PERIOD_S = 1.0
+LOG_PERIOD_NS = NS_PER_S
+SILENCE_LOG_PERIOD_NS = 10 * NS_PER_S
+ACKNOWLEDGED_WITHIN = Duration(nanoseconds=NS_PER_S // 5)
+
+
+def guarded(callback: Callable[..., None]) -> Callable[..., None]:
+    """Make a callback survive whatever goes wrong in it: counted and logged, and the node goes on."""
+
+    @wraps(callback)
+    def run(self: BeaconNode, *args: Any) -> None:
+        try:
+            callback(self, *args)
+        except Exception:
+            self.report.totals['internal_errors'] += 1
+            self.log_error('internal', f'in {callback.__name__}: {traceback.format_exc()}', time.monotonic_ns())
+
+    return run
+
+
+def reliable(depth: int, durability: DurabilityPolicy = DurabilityPolicy.VOLATILE) -> QoSProfile:
+    """Return the QoS of an output."""
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=durability
+    )
+
+
+class BeaconNode(Node):
+    """See the module's head.
+
+    Raises:
+        ParameterError: a parameter is refused.
+        CalibrationError: ``camera_info_file`` is refused.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(NODE_NAME, **options)
+        self._core, self._own = read_parameters(self)
+        for line in unknown_parameters(list(self._parameter_overrides)):
+            self.get_logger().warning(line)
+        self.report = Report()
+        self.log_error = ThrottledLog(self.get_logger().error, LOG_PERIOD_NS)
+        self.log_warning = ThrottledLog(self.get_logger().warning, LOG_PERIOD_NS)
+        self._log_silence = ThrottledLog(self.get_logger().warning, SILENCE_LOG_PERIOD_NS, counting=False)
+        self._log_quiet = ThrottledLog(self.get_logger().info, SILENCE_LOG_PERIOD_NS, counting=False)
+        self._silent_ns = round(self._own.silent_clock_after_s * NS_PER_S)
+        camera = load_camera(self._own.camera_info_file)
+        if camera is None and not self._own.use_camera_info:
+            self.get_logger().info('no calibration: bearings are pixels only (camera_info_file, use_camera_info)')
+        self._warm_up()
+        self._live = LiveReceiver(self._core, self._silent_ns, camera)
+        self._texts = Texts(self._own.text_codes)
+        self._lost: list[BeaconSnapshot] = []
+        self._topic = self.resolve_topic_name('events')
+        self._type: str | None = None
+        self._not_installed = ''
+        self._found = Publishers()
+        self._silence: Silence | None = None
+        self._subscription: Subscription | None = None
+        self._make_publishers()
+        self._make_inputs()
+        self._publish_confirmed()
+        self.get_logger().info(f'waiting for events on {self._topic}')
+
+    @guarded
+    def _warm_up(self) -> None:
+        warm_up(self._core)
+
+    def _make_publishers(self) -> None:
+        self._characters = self.create_publisher(Characters, '~/characters', reliable(1000))
+        self._text = self.create_publisher(Text, '~/text', reliable(100))
+        self._beacons = self.create_publisher(Beacons, '~/beacons', reliable(10))
+        self._bearings = self.create_publisher(Bearings, '~/bearings', reliable(10))
+        self._confirmed = self.create_publisher(Confirmed, '~/confirmed', reliable(1, DurabilityPolicy.TRANSIENT_LOCAL))
+        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', reliable(10))
+
+    def _make_inputs(self) -> None:
+        own = self._own
+        self._qos = QoSProfile(
+            history=HistoryPolicy.KEEP_LAST,
+            depth=own.qos_depth,
+            reliability=ReliabilityPolicy[own.qos_reliability.upper()],
+            durability=DurabilityPolicy.VOLATILE,
+        )
+        if own.use_camera_info:
+            self.create_subscription(CameraInfo, 'camera_info', self._on_camera_info, qos_profile_sensor_data)
+        # Timers run on the steady clock: under use_sim_time the node's own may stand.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._tick_s = own.silent_clock_after_s / 2.0
+        self.create_timer(self._tick_s, self._on_tick, clock=steady)
+        self.create_timer(1.0 / own.publish_rate_hz, self._on_publish, clock=steady)
+        self.create_timer(GRAPH_PERIOD_S, self._on_graph, clock=steady)
+        self.create_timer(REPORT_PERIOD_S, self._on_report, clock=steady)
+        backwards = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True)
+        self._jump = self.get_clock().create_jump_callback(
+            backwards, post_callback=lambda _: self._live.clock_was_set()
+        )
+
+    # --- inputs ---
+
+    @guarded
+    def _on_message(self, cdr: bytes, info: dict[str, int]) -> None:
+        waited_s = (time.time_ns() - info['received_timestamp']) / NS_PER_S
+        step = self._live.push(cdr, self._now_ns())
+        self.report.message(step, waited_s)
+        if step.problem is not None:
+            self.log_warning(step.problem_kind, f'{self._topic}: {step.problem}', time.monotonic_ns())
+        self._publish(step)
+
+    @guarded
+    def _on_tick(self) -> None:
+        step = self._live.tick(self._now_ns(), round(self._tick_s * NS_PER_S))
+        if step is not None:
+            self._publish(step)
+
+    @guarded
+    def _on_camera_info(self, message: CameraInfo) -> None:
+        try:
+            self._live.set_camera(camera_of_message(message))
+        except CalibrationError as error:
+            self.log_warning('camera_info', f'camera_info: {error}', time.monotonic_ns())
+
+    # --- outputs ---
+
+    def _publish(self, step: Step) -> None:
+        """Publish what is due at once, keep the rest for the next turn of :meth:`_on_publish`."""
+        if step.characters:
+            self._characters.publish(
+                conversions.characters_message(step.at, self._live.frame_id, step.characters)
+            )
+            for character in step.characters:
+                self._texts.add(character)
+        self._lost += step.lost
+        if step.confirmed_changed:
+            self._publish_confirmed()
+
+    def _publish_confirmed(self) -> None:
+        at = self._live.now(self._now_ns())
+        self._confirmed.publish(conversions.confirmed_message(at, self._live.frame_id, self._live.confirmed))
+
+    @guarded
+    def _on_publish(self) -> None:
+        frame_id = self._live.frame_id
+        for text in self._texts.take_changed():
+            self._text.publish(conversions.text_message(frame_id, text))
+        lost, self._lost = self._lost, []
+        for beacon in lost:
+            self._texts.forget(beacon.track_id)
+        if self._live.sensor_size is None:
+            return
+        at = self._live.now(self._now_ns())
+        beacons = self._live.beacons()
+        if self._beacons.get_subscription_count():
+            everything = (*beacons, *lost)
+            self._beacons.publish(
+                conversions.beacons_message(at, frame_id, everything, self._live.slots_full)
+            )
+        if self._bearings.get_subscription_count():
+            self._bearings.publish(conversions.bearings_message(at, frame_id, beacons))
+
+    # --- the event topic ---
+
+    @guarded
+    def _on_graph(self) -> None:
+        self._found = find_publishers(self, self._topic, self._qos)
+        message_type = choose_type(self._found.types, self._type)
+        if message_type not in (None, self._type, self._not_installed):
+            self._subscribe(message_type)
+
+    def _subscribe(self, message_type: str) -> None:
+        try:
+            cls = message_class(message_type)
+        except ImportError as error:
+            self._not_installed = message_type
+            self.get_logger().error(f'{self._topic} carries {message_type}, which is not installed here: {error}')
+            return
+        if self._subscription is not None:
+            self.destroy_subscription(self._subscription)
+        self._type, self._not_installed = message_type, ''
+        self._publish(self._live.open(message_type, self._now_ns()))
+        events = SubscriptionEventCallbacks(matched=self._on_matched, message_lost=self._on_message_lost)
+        self._subscription = self.create_subscription(
+            cls, self._topic, self._on_message, self._qos, raw=True, event_callbacks=events
+        )
+        self.get_logger().info(f'reading {self._topic} ({message_type})')
+
+    @guarded
+    def _on_matched(self, status: Any) -> None:
+        """Begin a new stream where a publisher comes after the last one had gone."""
+        if self._type is not None and status.current_count == status.current_count_change == 1:
+            self._publish(self._live.open(self._type, self._now_ns()))
+
+    @guarded
+    def _on_message_lost(self, status: Any) -> None:
+        self.report.totals['queue_overflow'] += status.total_count_change
+
+    # --- report ---
+
+    @guarded
+    def _on_report(self) -> None:
+        traffic, events, values = self.report.look(self._live, time.monotonic_ns())
+        unsubscribed = self._type not in self._found.types
+        situation = Situation(
+            topic=self._topic,
+            advertised=self._found.types,
+            supported=choose_type(self._found.types, self._type) is not None,
+            not_installed=self._not_installed if unsubscribed else '',
+            incompatible=self._found.incompatible,
+            similar=() if self._found.types else similar_topics(self, self._topic),
+            messages=traffic.messages,
+            events=events,
+            bad_messages=traffic.bad_messages,
+            problems=traffic.problem_text(),
+            tracks=self._live.beacons(),
+            index_threshold=self._core.index_threshold,
+        )
+        silence = why_silent(situation)
+        if silence is not None and silence == self._silence:
+            log = self._log_silence if silence.cause.is_fault else self._log_quiet
+            log(silence.cause.name, silence.text, time.monotonic_ns())
+        self._silence = silence
+        if self._live.camera_problem:
+            self._log_silence('camera', f'no bearings: {self._live.camera_problem}', time.monotonic_ns())
+        values = {'topic': self._topic, 'type': self._type or '', 'calibrated': self._live.calibrated, **values}
+        self._diagnostics.publish(
+            diagnostics_message(
+                self.get_clock().now().to_msg(), f'{self.get_name()}: events', self._live.frame_id, silence, values
+            )
+        )
+
+    def close(self) -> None:
+        """End the stream: publish what is still held, and wait a moment for it to arrive."""
+        self._flush()
+        for publisher in (self._characters, self._text, self._confirmed):
+            publisher.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
+
+    @guarded
+    def _flush(self) -> None:
+        self._publish(self._live.flush(self._now_ns()))
+        self._on_publish()
+
+    def _now_ns(self) -> int:
+        return self.get_clock().now().nanoseconds

@@ -1,0 +1,202 @@
+"""The live receiver: one topic's messages in, characters with both clocks' times out.
+
+::
+
+    CDR bytes ─► EventStream ─► StreamTime ─► Receiver ─► Step ─► (the node publishes)
+                     │                                     ▲
+                     └── header.stamp, first event ─► ClockMap
+
+It knows no ROS: the node gives it bytes and the time, and publishes what it returns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from beacon_comm.core.bearing import CameraModel
+from beacon_comm.core.errors import CalibrationError
+from beacon_comm.core.events import EventBatch
+from beacon_comm.core.parameters import Parameters
+from beacon_comm.core.receiver import BeaconSnapshot, Output, Receiver
+from beacon_comm.ros.clock_map import ClockMap
+from beacon_comm.ros.stamped import Instant, StampedCharacter
+from beacon_comm.ros.stream_time import StreamTime
+from beacon_comm.wire.stream import Decoded, EventStream
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What one message, one tick of a silent topic or the end of the stream gave.
+
+    Attributes:
+        at: the stream's time after it.
+        characters: in order of decision.
+        lost: last snapshots of the tracks that were lost.
+        confirmed_changed: the set of confirmed beacons is another one than before.
+        problem: why the message was not read, None if it was.
+        problem_kind: the kind it was counted under, '' if none.
+    """
+
+    at: Instant
+    characters: tuple[StampedCharacter, ...] = ()
+    lost: tuple[BeaconSnapshot, ...] = ()
+    confirmed_changed: bool = False
+    problem: str | None = None
+    problem_kind: str = ''
+
+
+class LiveReceiver:
+    """Reads one topic.  All ``now_ns`` are the node's clock (ns).
+
+    Args:
+        parameters: the receiver's.
+        silent_after_ns: see :class:`StreamTime`.
+        camera: calibration, None for pixels only.
+    """
+
+    def __init__(self, parameters: Parameters, silent_after_ns: int, camera: CameraModel | None = None) -> None:
+        self._parameters = parameters
+        self._camera = camera
+        self._stream: EventStream | None = None
+        self._receiver: Receiver | None = None
+        self._time = StreamTime(silent_after_ns)
+        self._clock_map = ClockMap()
+        self._gathered: list[StampedCharacter] = []
+        self._lost: list[BeaconSnapshot] = []
+        self._confirmed_changed = False
+        self.camera_problem = ''
+        self.sensor_size: tuple[int, int] | None = None
+        self.frame_id = ''
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Counts by kind since the topic's reader was made."""
+        counts = {} if self._stream is None else dict(self._stream.counts)
+        counts['late_packets'] = self._time.late_packets
+        return counts
+
+    @property
+    def confirmed(self) -> tuple[int, ...]:
+        """Labels of the confirmed beacons."""
+        return () if self._receiver is None else self._receiver.confirmed
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether bearings are known, not only pixels."""
+        return self._camera is not None and not self.camera_problem
+
+    @property
+    def slots_full(self) -> bool:
+        """Whether candidates wait because every slot is taken."""
+        return self._receiver is not None and self._receiver.slots_full
+
+    def open(self, message_type: str, now_ns: int) -> Step:
+        """Read messages of this type from now on: another publisher, another stream; labels go on."""
+        self._stream = EventStream(message_type)
+        self._restart()
+        return self._step(now_ns)
+
+    def push(self, cdr: bytes, now_ns: int) -> Step:
+        """Take one message as it came over the wire."""
+        if self._stream is None:
+            raise RuntimeError('no stream is open')
+        decoded = self._stream.push(cdr)
+        if decoded.restarted:
+            self._restart()
+        if decoded.batch is not None:
+            receiver = self._follow(decoded)
+            self._tie(decoded, decoded.batch, now_ns)
+            self._gather(receiver.push(self._time.admit(decoded.batch, now_ns)))
+        return self._step(now_ns, decoded.problem, decoded.problem_kind or '')
+
+    def tick(self, now_ns: int, period_ns: int) -> Step | None:
+        """Carry the time of a silent topic on; to be called every ``period_ns``."""
+        if self._receiver is None or (batch := self._time.tick(now_ns, period_ns)) is None:
+            return None
+        self._gather(self._receiver.push(batch))
+        return self._step(now_ns)
+
+    def flush(self, now_ns: int) -> Step:
+        """End the stream: give out what is still held."""
+        if self._receiver is not None:
+            self._gather(self._receiver.flush())
+        return self._step(now_ns)
+
+    def clock_was_set(self) -> None:
+        """Begin the clock map anew: ROS time has jumped back."""
+        self._clock_map.renew()
+
+    def set_camera(self, camera: CameraModel | None) -> None:
+        """Take another calibration from now on."""
+        self._camera = camera
+        self._fit_camera()
+
+    def beacons(self) -> tuple[BeaconSnapshot, ...]:
+        """Return all tracks at the stream's time."""
+        return () if self._receiver is None else self._receiver.beacons()
+
+    def now(self, now_ns: int) -> Instant:
+        """Return the stream's time; ROS time is the node's clock before the first event."""
+        stream_ns = None if self._receiver is None else self._receiver.t_ns
+        if stream_ns is None or not self._clock_map.ready:
+            return Instant(now_ns, 0)
+        sensor_ns = self._time.sensor_ns(stream_ns)
+        return Instant(self._clock_map.header_ns(sensor_ns), sensor_ns)
+
+    def instant(self, stream_ns: int) -> Instant:
+        """Return a time of the stream (ns) on both clocks."""
+        sensor_ns = self._time.sensor_ns(stream_ns)
+        return Instant(self._clock_map.ros_ns(sensor_ns), sensor_ns)
+
+    def _follow(self, decoded: Decoded) -> Receiver:
+        """Follow what the message says about its sensor: seen for the first time, or of another size."""
+        size = (decoded.width, decoded.height)
+        if self._receiver is None:
+            self._receiver = Receiver(self._parameters, size)
+        elif size != self.sensor_size:
+            self._gather(self._receiver.resize(size))
+        self.frame_id = decoded.frame_id
+        if size != self.sensor_size:
+            self.sensor_size = size
+            self._fit_camera()
+        return self._receiver
+
+    def _fit_camera(self) -> None:
+        """Give the receiver the calibration if it is of a sensor of this size; another one's bearings would be wrong."""
+        self.camera_problem = ''
+        if self._receiver is None or self.sensor_size is None:
+            return
+        camera = self._camera
+        try:
+            if camera is not None:
+                camera.check_size(self.sensor_size)
+        except CalibrationError as error:
+            camera, self.camera_problem = None, str(error)
+        self._receiver.set_camera(camera)
+
+    def _restart(self) -> None:
+        if self._receiver is not None:
+            self._gather(self._receiver.reset())
+        self._time.reset()
+        self._clock_map.renew()
+
+    def _tie(self, decoded: Decoded, batch: EventBatch, now_ns: int) -> None:
+        """Tie the two clocks together; a driver without a clock stamps 0, then it is the time of arrival."""
+        stamp_ns = decoded.stamp_ns if decoded.stamp_ns > 0 else now_ns
+        if decoded.first_event_ns is not None:
+            self._clock_map.observe(stamp_ns, decoded.first_event_ns)
+        elif not self._clock_map.ready:
+            self._clock_map.observe(stamp_ns, batch.t_end_ns)
+
+    def _gather(self, output: Output) -> None:
+        """Stamp what the core gave, while the maps are those it was made under."""
+        for received in output.characters:
+            character = received.character
+            self._gathered.append(StampedCharacter(received.track_id, character, self.instant(character.t_ns)))
+        self._lost += output.lost
+        self._confirmed_changed |= output.confirmed_changed
+
+    def _step(self, now_ns: int, problem: str | None = None, problem_kind: str = '') -> Step:
+        characters, lost, changed = tuple(self._gathered), tuple(self._lost), self._confirmed_changed
+        self._gathered, self._lost, self._confirmed_changed = [], [], False
+        return Step(self.now(now_ns), characters, lost, changed, problem, problem_kind)

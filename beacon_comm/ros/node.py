@@ -1,0 +1,91 @@
+"""``beacon_node``: starts the node, keeps it running, ends it.
+
+Exit code 0 after Ctrl-C (once or twice: ``ros2 launch`` sends a second one) and SIGTERM, 2 when a parameter or the
+calibration is refused.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Sequence
+from types import FrameType
+
+EXIT_REFUSED = 2
+
+
+class StopSignal:
+    """SIGINT and SIGTERM: interrupt the start, then only ask the running node to end; later ones change nothing.
+
+    rclpy's own handlers would take the publishers away before the last characters are out.
+    """
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._starting = True
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._on_signal)
+
+    def started(self) -> None:
+        """From now on a signal interrupts nothing."""
+        self._starting = False
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self.requested = True
+        if self._starting:
+            self._starting = False
+            raise KeyboardInterrupt
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node until it is told to end; return the exit code."""
+    stop = StopSignal()
+    try:
+        return _run(args, stop)
+    except KeyboardInterrupt:
+        return 0
+    finally:
+        stop.started()
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _run(args: Sequence[str] | None, stop: StopSignal) -> int:
+    from beacon_comm.ros.compiler_cache import ensure_compiler_cache
+
+    ensure_compiler_cache()  # before anything imports numba
+    import rclpy
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+    from rclpy.signals import SignalHandlerOptions
+
+    from beacon_comm.core.errors import BeaconCommError
+    from beacon_comm.ros.beacon_node import NODE_NAME, BeaconNode
+
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # rcl's own: a parameter file or rule that cannot be parsed
+        print(f'{NODE_NAME}: {str(error).splitlines()[0]}', file=sys.stderr)
+        return EXIT_REFUSED
+    node = None
+    try:
+        node = BeaconNode()
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        stop.started()
+        while rclpy.ok() and not stop.requested:
+            executor.spin_once()  # the node's timers bound the wait
+    except BeaconCommError as error:
+        rclpy.logging.get_logger(NODE_NAME).fatal(str(error))
+        return EXIT_REFUSED
+    except ExternalShutdownException:
+        pass
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        if node is not None:
+            node.close()
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,83 @@
+"""The event topic on the ROS graph: who publishes it, of which type, and whether the two ends fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from importlib import import_module
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+from beacon_comm.wire.stream import SUPPORTED_TYPES, is_event_array_type
+
+MAX_HINTS = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Publishers:
+    """The publishers of the event topic at one moment.
+
+    Attributes:
+        types: their types, one entry a publisher.
+        gids: their identities.
+        incompatible: why none of them fits our QoS, '' if one does or there is none.
+    """
+
+    types: tuple[str, ...] = ()
+    gids: frozenset[bytes] = field(default_factory=frozenset)
+    incompatible: str = ''
+
+
+def is_supported(message_type: str) -> bool:
+    """Tell whether a type (``package/msg/Name``) can be read."""
+    return message_type in SUPPORTED_TYPES or is_event_array_type(message_type)
+
+
+def choose_type(advertised: tuple[str, ...], current: str | None) -> str | None:
+    """Return the type to subscribe: the current one while anyone advertises it, else the first that can be read."""
+    if current in advertised:
+        return current
+    return next((name for name in advertised if is_supported(name)), None)
+
+
+def message_class(message_type: str) -> Any:
+    """Return the Python class of a type such as ``event_camera_msgs/msg/EventPacket``.
+
+    Raises:
+        ImportError: its package is not installed, or has no such message.
+    """
+    package, _, name = message_type.split('/')
+    try:
+        return getattr(import_module(f'{package}.msg'), name)
+    except AttributeError as error:
+        raise ImportError(f'{package}.msg has no {name}') from error
+
+
+def find_publishers(node: Node, topic: str, qos: QoSProfile) -> Publishers:
+    """Look at the graph: the publishers of a resolved topic name, against the QoS we ask for."""
+    infos = node.get_publishers_info_by_topic(topic)
+    mismatches = [_mismatch(info, qos) for info in infos]
+    return Publishers(
+        types=tuple(info.topic_type for info in infos),
+        gids=frozenset(bytes(info.endpoint_gid) for info in infos),
+        incompatible='; '.join(filter(None, mismatches)) if mismatches and all(mismatches) else '',
+    )
+
+
+def similar_topics(node: Node, topic: str) -> tuple[str, ...]:
+    """Return other topics that carry a type we can read, as ``name (type)``."""
+    return tuple(
+        f'{name} ({message_type})'
+        for name, types in node.get_topic_names_and_types()
+        for message_type in types
+        if name != topic and is_supported(message_type)
+    )[:MAX_HINTS]
+
+
+def _mismatch(info: TopicEndpointInfo, qos: QoSProfile) -> str:
+    compatibility, reason = qos_check_compatible(info.qos_profile, qos)
+    if compatibility != QoSCompatibility.ERROR:
+        return ''
+    return f'{info.node_name} publishes {info.qos_profile.reliability.name.lower()} ({reason.strip().rstrip(";")})'

@@ -1,0 +1,204 @@
+"""Core values to messages, the printable text, the reasons for silence, and where a calibration is found."""
+
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy')
+
+from hypothesis import given  # noqa: E402
+from hypothesis import strategies as st  # noqa: E402
+
+from beacon_comm.core.candidates import BeaconState  # noqa: E402
+from beacon_comm.core.character import Character, Status  # noqa: E402
+from beacon_comm.core.errors import CalibrationError  # noqa: E402
+from beacon_comm.core.receiver import BeaconSnapshot  # noqa: E402
+from beacon_comm.ros import conversions  # noqa: E402
+from beacon_comm.ros.camera import load_camera, resolve_url  # noqa: E402
+from beacon_comm.ros.silence import Cause, Situation, why_silent  # noqa: E402
+from beacon_comm.ros.stamped import Instant, StampedCharacter  # noqa: E402
+from beacon_comm.ros.text import Texts, printable  # noqa: E402
+from beacon_comm.ros.throttled_log import ThrottledLog  # noqa: E402
+
+AT = Instant(1_700_000_000_123_456_789, 2**40)
+
+
+def character(code: int = ord('S'), track_id: int = 7, status: Status = Status.OK) -> StampedCharacter:
+    return StampedCharacter(track_id, Character(2**40, code, status, 0.75, 0b01010011011, 503.8), AT)
+
+
+def beacon(**changes: object) -> BeaconSnapshot:
+    values: dict[str, object] = {
+        'track_id': 3, 'state': BeaconState.CONFIRMED, 'quiet': False, 't_ns': 2**40, 'x_px': 100.5, 'y_px': 50.25,
+        'vx_px_per_s': 1.0, 'vy_px_per_s': -2.0, 'extent_px': 4.0, 'index': 6.0, 'bit_rate_bps': 504.0,
+        'confirmed_at_ns': 2**40, 'characters': 20, 'characters_ok': 18, 'parity_errors': 1, 'framing_errors': 1,
+        'bearing': np.array([0.0, 0.6, 0.8]), 'azimuth_rad': 0.1, 'elevation_rad': -0.2, 'age_s': 0.03,
+    }
+    return BeaconSnapshot(**{**values, **changes})  # type: ignore[arg-type]
+
+
+# --- messages ---
+
+
+@given(st.integers(-(2**31) * 10**9, (2**31 - 1) * 10**9))
+def test_a_time_survives(t_ns: int) -> None:
+    message = conversions.time_message(t_ns)
+    assert message.sec * 10**9 + message.nanosec == t_ns
+    assert 0 <= message.nanosec < 10**9
+
+
+def test_a_time_beyond_the_message_is_cut() -> None:
+    assert conversions.time_message(2**62).sec == 2**31 - 1
+
+
+def test_a_character_keeps_every_field() -> None:
+    message = conversions.characters_message(AT, 'camera', [character(), character(10, 8, Status.PARITY_ERROR)])
+    assert message.header.frame_id == 'camera'
+    assert message.sensor_time_ns == 2**40
+    first, second = message.characters
+    assert (first.track_id, first.code, first.status) == (7, ord('S'), first.OK)
+    assert (second.track_id, second.code, second.status) == (8, 10, second.PARITY_ERROR)
+    assert (first.confidence, first.sensor_time_ns) == (0.75, 2**40)
+    assert first.bit_rate_bps == pytest.approx(503.8)
+    assert (first.stamp.sec, first.stamp.nanosec) == (1_700_000_000, 123_456_789)
+
+
+def test_the_states_and_statuses_are_those_of_the_messages() -> None:
+    for state in BeaconState:
+        assert getattr(conversions.Beacon, state.name) == state
+    for status in Status:
+        assert getattr(conversions.Character, status.name) == status
+
+
+def test_a_calibrated_beacon_has_a_bearing() -> None:
+    message = conversions.beacons_message(AT, 'camera', [beacon()], slots_full=True)
+    assert message.slots_full
+    assert message.beacons[0].has_bearing
+    assert (message.beacons[0].bearing.y, message.beacons[0].bearing.z) == (0.6, 0.8)
+    assert message.beacons[0].beacon_id == ''
+    (bearing,) = conversions.bearings_message(AT, 'camera', [beacon()]).bearings
+    assert (bearing.azimuth_rad, bearing.elevation_rad, bearing.age_s) == (0.1, -0.2, 0.03)
+    assert bearing.covariance[0] == -1.0
+
+
+def test_an_uncalibrated_beacon_says_so() -> None:
+    without = beacon(bearing=None, azimuth_rad=None, elevation_rad=None, bit_rate_bps=None)
+    (message,) = conversions.beacons_message(AT, '', [without], slots_full=False).beacons
+    assert not message.has_bearing and math.isnan(message.bearing.x) and math.isnan(message.bit_rate_bps)
+    (bearing,) = conversions.bearings_message(AT, '', [without]).bearings
+    assert not bearing.has_bearing and math.isnan(bearing.azimuth_rad) and bearing.x_px == 100.5
+
+
+def test_only_confirmed_beacons_have_bearings() -> None:
+    beacons = [beacon(track_id=k, state=state) for k, state in enumerate(BeaconState)]
+    message = conversions.bearings_message(AT, 'camera', beacons)
+    assert [bearing.track_id for bearing in message.bearings] == [BeaconState.CONFIRMED]
+
+
+def test_a_value_too_large_for_its_field_is_no_error() -> None:
+    (message,) = conversions.beacons_message(AT, '', [beacon(index=1e300, x_px=-1e300)], False).beacons
+    assert message.index == math.inf and message.x_px == -math.inf
+
+
+# --- text ---
+
+
+def test_what_cannot_be_printed_is_escaped() -> None:
+    assert printable(b'Shall I\n\r\t\\ \x00\x7f\xff~') == r'Shall I\n\r\t\\ \x00\x7f\xff~'
+
+
+@given(st.binary(max_size=50))
+def test_a_printable_text_can_be_read_back(codes: bytes) -> None:
+    text = printable(codes)
+    assert text.isascii() and text.isprintable()
+    assert text.encode().decode('unicode_escape').encode('latin1') == codes
+
+
+def test_a_text_keeps_its_last_codes_and_counts_all() -> None:
+    texts = Texts(kept=4)
+    for code in b'ABCDEF':
+        texts.add(character(code))
+    texts.add(character(ord('z'), track_id=9, status=Status.PARITY_ERROR))
+    first, second = texts.take_changed()
+    assert (first.track_id, first.first_index, first.codes, first.statuses) == (7, 2, b'CDEF', bytes(4))
+    assert (second.track_id, second.first_index, second.codes, second.statuses) == (9, 0, b'z', b'\x02')
+    assert texts.take_changed() == []
+    message = conversions.text_message('camera', first)
+    assert (bytes(message.codes), message.text, message.first_index) == (b'CDEF', 'CDEF', 2)
+
+
+def test_a_lost_beacons_text_is_dropped() -> None:
+    texts = Texts(kept=4)
+    texts.add(character())
+    texts.forget(7)
+    assert texts.take_changed() == []
+    texts.add(character())
+    assert texts.take_changed()[0].first_index == 0
+
+
+# --- silence ---
+
+TYPE = 'event_camera_msgs/msg/EventPacket'
+HEARD = {'topic': '/events', 'advertised': (TYPE,), 'supported': True, 'messages': 100, 'events': 1000}
+CASES = [
+    (Cause.NO_PUBLISHER, {'advertised': (), 'similar': ('/cam/events (x)',)}, r'no publisher on /events.*/cam/events'),
+    (Cause.WRONG_TYPE, {'advertised': ('sensor_msgs/msg/Image',), 'supported': False}, 'sensor_msgs/msg/Image'),
+    (Cause.NOT_INSTALLED, {'not_installed': 'dvs_msgs/msg/EventArray'}, 'package dvs_msgs is not installed'),
+    (Cause.INCOMPATIBLE_QOS, {'messages': 0, 'incompatible': 'driver publishes best_effort'}, 'best_effort'),
+    (Cause.NO_MESSAGES, {'messages': 0}, 'no messages come'),
+    (Cause.UNREADABLE, {'bad_messages': 100, 'events': 0, 'problems': 'encoding (100)'}, r'encoding \(100\)'),
+    (Cause.NO_EVENTS, {'events': 0}, 'hold no events'),
+    (Cause.BELOW_THRESHOLD, {'index_threshold': 1.5}, 'index_threshold = 1.5'),
+    (
+        Cause.UNCONFIRMED,
+        {'tracks': (beacon(state=BeaconState.DEMODULATING),)},
+        'track 3 has 18 of 20 characters ok, 1 parity and 1 framing errors',
+    ),
+    (Cause.UNCONFIRMED, {'tracks': (beacon(state=BeaconState.WAITING, characters=0),)}, 'none has given a character'),
+]
+
+
+@pytest.mark.parametrize(('cause', 'changes', 'text'), CASES)
+def test_a_silence_has_its_reason(cause: Cause, changes: dict[str, object], text: str) -> None:
+    silence = why_silent(Situation(**{**HEARD, **changes}))  # type: ignore[arg-type]
+    assert silence is not None and silence.cause is cause
+    assert re.search(text, silence.text)
+
+
+def test_a_confirmed_beacon_is_no_silence() -> None:
+    assert why_silent(Situation(**{**HEARD, 'tracks': (beacon(),)})) is None  # type: ignore[arg-type]
+
+
+def test_an_empty_scene_is_no_fault() -> None:
+    assert [cause.is_fault for cause in Cause] == [True] * 6 + [False] * 3
+
+
+def test_a_throttled_log_says_how_often_it_kept_quiet() -> None:
+    lines: list[str] = []
+    log = ThrottledLog(lines.append, period_ns=100)
+    for now_ns in (0, 10, 99, 100, 150):
+        log('a', 'text', now_ns)
+    log('b', 'other', 150)
+    assert lines == ['text', 'text (and 2 more since the last such line)', 'other']
+
+
+# --- calibration ---
+
+
+def test_a_calibration_is_a_path_or_a_url(tmp_path: Path) -> None:
+    assert resolve_url(str(tmp_path / 'c.yaml')) == tmp_path / 'c.yaml'
+    assert resolve_url(f'file://{tmp_path}/a%20b.yaml') == tmp_path / 'a b.yaml'
+    assert resolve_url('package://rclpy/config/c.yaml').parts[-4:] == ('share', 'rclpy', 'config', 'c.yaml')
+
+
+@pytest.mark.parametrize('url', ['http://host/c.yaml', 'package://no_such_package/c.yaml', '/no/such/file.yaml'])
+def test_a_calibration_that_is_not_there_is_refused_by_name(url: str) -> None:
+    with pytest.raises(CalibrationError, match=url.replace('.', r'\.')):
+        load_camera(url)
+
+
+def test_no_calibration_is_none() -> None:
+    assert load_camera('') is None

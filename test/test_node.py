@@ -1,0 +1,384 @@
+"""The node as a process of its own, over DDS: event packets in, characters, texts, bearings and reasons out."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip('rclpy')
+messages = pytest.importorskip('beacon_comm.msg')
+EventPacket = pytest.importorskip('event_camera_msgs.msg').EventPacket
+
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
+from sensor_msgs.msg import CameraInfo  # noqa: E402
+
+from beacon_comm.core.character import Status  # noqa: E402
+from beacon_comm.core.events import NS_PER_S, EventBatch  # noqa: E402
+from beacon_comm.simulation.led import simulate_text  # noqa: E402
+from beacon_comm.wire.cdr import build_event_packet  # noqa: E402
+from beacon_comm.wire.evt3_encoder import Evt3Encoder  # noqa: E402
+
+DOMAIN = 1 + os.getpid() % 100
+START_TIMEOUT_S = 120  # the first start compiles
+TIMEOUT_S = 20
+STAMP_NS = 1_700_000_000 * NS_PER_S
+OFFSET_NS = STAMP_NS - NS_PER_S
+"""ROS time less sensor time in what these tests publish."""
+PACKET_NS = 5_000_000
+SIZE = (64, 48)
+BIT_RATE = 3125.0
+TEXT = "Shall I compare thee to a summer's day?\n"
+
+
+class NodeProcess:
+    """The node under test."""
+
+    def __init__(self, folder: Path, *arguments: str) -> None:
+        self.log = folder / f'node_{time.monotonic_ns()}.log'
+        environment = {
+            **os.environ, 'ROS_DOMAIN_ID': str(DOMAIN), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+            'ROS_LOG_DIR': str(folder), 'RCUTILS_COLORIZED_OUTPUT': '0',
+        }
+        with self.log.open('w') as log:
+            self.process = subprocess.Popen(
+                [sys.executable, '-m', 'beacon_comm.ros.node', '--ros-args', *arguments],
+                stdout=log, stderr=subprocess.STDOUT, env=environment, cwd=folder,
+            )
+
+    def output(self) -> str:
+        return self.log.read_text()
+
+    def wait_for(self, text: str, timeout_s: float = START_TIMEOUT_S) -> None:
+        deadline = time.monotonic() + timeout_s
+        while text not in self.output():
+            assert self.process.poll() is None, self.output()
+            assert time.monotonic() < deadline, f'no {text!r} in:\n{self.output()}'
+            time.sleep(0.02)
+
+    def exit_code(self, timeout_s: float = TIMEOUT_S) -> int:
+        return self.process.wait(timeout_s)
+
+    def kill(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+
+
+class Peer:
+    """The other end: a driver and a listener in the test's own process."""
+
+    def __init__(self) -> None:
+        self.context = rclpy.Context()
+        self.context.init(domain_id=DOMAIN)
+        self.node = rclpy.create_node('test_peer', context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.heard: dict[str, list[Any]] = defaultdict(list)
+        self.publisher: Any = None
+
+    def listen(self, topic: str, kind: Any, latched: bool = False) -> None:
+        durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+        qos = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
+        self.node.create_subscription(kind, topic, self.heard[topic].append, qos)
+
+    def advertise(self, kind: Any, topic: str, reliability: ReliabilityPolicy) -> None:
+        self.publisher = self.node.create_publisher(kind, topic, QoSProfile(depth=1000, reliability=reliability))
+
+    def spin_until(self, condition: Callable[[], object], timeout_s: float = TIMEOUT_S) -> bool:
+        deadline = time.monotonic() + timeout_s
+        while not condition():
+            if time.monotonic() > deadline:
+                return False
+            self.executor.spin_once(timeout_sec=0.02)
+        return True
+
+    def spin_for(self, seconds: float) -> None:
+        self.spin_until(lambda: False, seconds)
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        self.node.destroy_node()
+        self.context.try_shutdown()
+
+
+def beacon_events(text: str, start_ns: int, x_px: int, y_px: int, seed: int = 0) -> EventBatch:
+    """Return a beacon's events in a disc of 4 px; the stream's time ends with the last of them."""
+    t_ns, polarity = simulate_text(text, BIT_RATE, t0_ns=start_ns, lead_s=0.0, tail_s=0.0, seed=seed)
+    random = np.random.default_rng(seed)
+    angle, radius = random.uniform(0.0, 2.0 * np.pi, len(t_ns)), 4.0 * np.sqrt(random.uniform(0.0, 1.0, len(t_ns)))
+    x = np.round(x_px + radius * np.cos(angle)).astype(np.uint16)
+    y = np.round(y_px + radius * np.sin(angle)).astype(np.uint16)
+    return EventBatch(x, y, polarity, t_ns, int(t_ns[-1]))
+
+
+def packets(events: EventBatch, stamp_jitter_ns: int = 0) -> list[bytes]:
+    """Cut events into packets as a driver sends them; every stamp belongs to its packet's first event."""
+    encoder = Evt3Encoder(*SIZE)
+    first_ns = int(events.t_ns[0])
+    cuts = np.searchsorted(events.t_ns, np.arange(first_ns, events.t_end_ns + PACKET_NS, PACKET_NS))
+    cuts[-1] = len(events)
+    messages_out = []
+    for k, (start, stop) in enumerate(zip(cuts[:-1], cuts[1:], strict=True)):
+        if start == stop:
+            continue
+        part = events.slice(int(start), int(stop), int(events.t_ns[stop - 1]))
+        messages_out.append(
+            build_event_packet(
+                stamp_ns=int(part.t_ns[0]) + OFFSET_NS + stamp_jitter_ns * (k % 2),
+                frame_id='event_camera', width=SIZE[0], height=SIZE[1], seq=len(messages_out), time_base_ns=0,
+                encoding='evt3', payload=encoder.encode(part),
+            )
+        )
+    return messages_out
+
+
+def publish(peer: Peer, stream: list[bytes]) -> None:
+    """Publish packets at their own pace."""
+    for message in stream:
+        peer.publisher.publish(message)
+        peer.spin_for(PACKET_NS / NS_PER_S)
+
+
+def nanoseconds(stamp: Any) -> int:
+    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
+
+
+@pytest.fixture(scope='module')
+def domain() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+        patch.setenv('ROS_DOMAIN_ID', str(DOMAIN))
+        yield
+
+
+@pytest.fixture
+def peer(domain: None) -> Iterator[Peer]:
+    one = Peer()
+    yield one
+    one.close()
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp('node')
+
+
+@pytest.fixture
+def start(folder: Path) -> Iterator[Callable[..., NodeProcess]]:
+    running: list[NodeProcess] = []
+
+    def start_one(*arguments: str) -> NodeProcess:
+        running.append(NodeProcess(folder, *arguments))
+        return running[-1]
+
+    yield start_one
+    for node in running:
+        node.kill()
+
+
+OUTPUTS = {
+    '/beacon_node/characters': 'Characters', '/beacon_node/text': 'Text', '/beacon_node/beacons': 'Beacons',
+    '/beacon_node/bearings': 'Bearings',
+}
+
+
+def connect(peer: Peer, node: NodeProcess) -> None:
+    """Listen to every output, publish on the event topic, and wait until the node reads it."""
+    for topic, kind in OUTPUTS.items():
+        peer.listen(topic, getattr(messages, kind))
+    peer.listen('/beacon_node/confirmed', messages.Confirmed, latched=True)
+    peer.listen('/diagnostics', DiagnosticArray)
+    node.wait_for('waiting for events on /camera/events')
+    peer.advertise(EventPacket, '/camera/events', ReliabilityPolicy.BEST_EFFORT)
+    assert peer.spin_until(peer.publisher.get_subscription_count), node.output()
+    assert peer.spin_until(
+        lambda: all(peer.node.count_publishers(topic) for topic in OUTPUTS) and peer.heard['/beacon_node/confirmed']
+    )
+
+
+def characters(peer: Peer) -> list[Any]:
+    return [character for message in peer.heard['/beacon_node/characters'] for character in message.characters]
+
+
+def status(peer: Peer) -> Any:
+    return peer.heard['/diagnostics'][-1].status[0]
+
+
+def values(peer: Peer) -> dict[str, str]:
+    return {entry.key: entry.value for entry in status(peer).values}
+
+
+def test_a_beacon_is_read_confirmed_and_its_last_character_comes_out(
+    peer: Peer, start: Callable[..., NodeProcess]
+) -> None:
+    node = start('-r', 'events:=/camera/events', '-p', 'bit_rates:=[3125]', '-p', 'publish_rate_hz:=20')
+    connect(peer, node)
+    assert list(peer.heard['/beacon_node/confirmed'][0].track_ids) == []
+    sent = 6 * TEXT
+    stream = packets(beacon_events(sent, NS_PER_S, 30, 20))
+    publish(peer, stream)
+    # No packet follows: the last character needs the silent topic's clock.
+    peer.spin_until(lambda: characters(peer) and characters(peer)[-1].code == ord('\n'))
+    read = ''.join(chr(character.code) for character in characters(peer))
+    assert sent.endswith(read[-len(sent) + 20 :]) and len(read) > len(sent) - 40, node.output()
+
+    (track_id,) = {character.track_id for character in characters(peer)}
+    assert peer.spin_until(lambda: list(peer.heard['/beacon_node/confirmed'][-1].track_ids) == [track_id])
+    assert peer.spin_until(lambda: peer.heard['/beacon_node/text'][-1].text.endswith(r'day?\n'))
+    text = peer.heard['/beacon_node/text'][-1]
+    assert bytes(text.codes).decode() == read and text.first_index == 0 and text.track_id == track_id
+
+    assert peer.spin_until(lambda: any(message.bearings for message in peer.heard['/beacon_node/bearings']))
+    bearing = next(message for message in peer.heard['/beacon_node/bearings'] if message.bearings).bearings[0]
+    assert (bearing.x_px, bearing.y_px) == pytest.approx((30.0, 20.0), abs=1.0)
+    assert not bearing.has_bearing and bearing.covariance[0] == -1.0
+    beacon = peer.heard['/beacon_node/beacons'][-1].beacons[0]
+    assert beacon.state == beacon.CONFIRMED and beacon.bit_rate_bps == pytest.approx(BIT_RATE, rel=0.01)
+
+    check_times(peer)
+    check_a_late_listener_hears_what_is_confirmed(track_id)
+    check_garbage_is_counted(peer, node)
+    check_a_track_is_lost_once(peer, track_id)
+
+    node.process.send_signal(signal.SIGINT)
+    assert node.exit_code() == 0, node.output()
+    assert 'Traceback' not in node.output()
+
+
+def check_times(peer: Peer) -> None:
+    """Stamps are ROS time of the observation, the frame is the input's, and time never runs backwards."""
+    for character in characters(peer):
+        assert nanoseconds(character.stamp) - character.sensor_time_ns == pytest.approx(OFFSET_NS, abs=1000)
+        assert 0.0 <= character.confidence <= 1.0 and character.status in set(Status)
+    for topic in OUTPUTS:
+        heard = peer.heard[topic]
+        assert {message.header.frame_id for message in heard} == {'event_camera'}, topic
+        stamps = [nanoseconds(message.header.stamp) for message in heard]
+        assert stamps == sorted(stamps), topic
+        for message in heard:
+            difference_ns = nanoseconds(message.header.stamp) - message.sensor_time_ns
+            assert difference_ns == pytest.approx(OFFSET_NS, abs=1000)
+
+
+def check_a_late_listener_hears_what_is_confirmed(track_id: int) -> None:
+    late = Peer()
+    late.listen('/beacon_node/confirmed', messages.Confirmed, latched=True)
+    assert late.spin_until(lambda: late.heard['/beacon_node/confirmed'])
+    assert list(late.heard['/beacon_node/confirmed'][0].track_ids) == [track_id]
+    late.close()
+
+
+def check_garbage_is_counted(peer: Peer, node: NodeProcess) -> None:
+    random = np.random.default_rng(1)
+    good = packets(beacon_events('x', NS_PER_S, 30, 20))[0]
+    garbage = [b'\x00\x01\x00\x00' + random.bytes(n) for n in (1, 20, 300)] + [good[: len(good) // 2], good[:40]]
+    other = build_event_packet(
+        stamp_ns=STAMP_NS, frame_id='other_camera', width=64, height=48, seq=0, time_base_ns=0, encoding='evt3',
+        payload=b'',
+    )
+    for message in [*garbage, other]:
+        peer.publisher.publish(message)
+        peer.spin_for(0.01)
+    assert peer.spin_until(lambda: values(peer).get('refused_frames') == '1'), status(peer)
+    assert int(values(peer)['bad_messages']) == len(garbage)
+    assert 'other_camera' in node.output()
+
+
+def check_a_track_is_lost_once(peer: Peer, track_id: int) -> None:
+    """After lost_after_s of silence the track is published as lost, once, and nothing is confirmed any more."""
+    assert peer.spin_until(lambda: list(peer.heard['/beacon_node/confirmed'][-1].track_ids) == [])
+    peer.spin_for(0.2)
+    states = [
+        beacon.state for message in peer.heard['/beacon_node/beacons'] for beacon in message.beacons
+        if beacon.track_id == track_id
+    ]
+    assert states.count(messages.Beacon.LOST) == 1 and states[-1] == messages.Beacon.LOST
+
+
+def test_silence_is_explained_and_a_calibration_gives_bearings(
+    peer: Peer, start: Callable[..., NodeProcess]
+) -> None:
+    node = start(
+        '-r', 'events:=/camera/events', '-p', 'qos_reliability:=reliable', '-p', 'use_camera_info:=true', '-p',
+        'bit_rates:=[3125]', '-p', 'text_codes:=5',
+    )
+    peer.listen('/diagnostics', DiagnosticArray)
+    peer.listen('/beacon_node/bearings', messages.Bearings)
+    peer.listen('/beacon_node/text', messages.Text)
+    other = peer.node.create_publisher(EventPacket, '/other/events', 1)
+    assert peer.spin_until(
+        lambda: peer.heard['/diagnostics'] and '/other/events' in status(peer).message, START_TIMEOUT_S
+    ), node.output()
+    assert status(peer).message.startswith('no publisher on /camera/events')
+    peer.node.destroy_publisher(other)
+
+    wrong = peer.node.create_publisher(CameraInfo, '/camera/events', 1)
+    assert peer.spin_until(lambda: 'carries sensor_msgs/msg/CameraInfo' in status(peer).message), status(peer)
+    peer.node.destroy_publisher(wrong)
+
+    peer.advertise(EventPacket, '/camera/events', ReliabilityPolicy.BEST_EFFORT)
+    assert peer.spin_until(lambda: 'QoS of /camera/events does not match' in status(peer).message), status(peer)
+    peer.node.destroy_publisher(peer.publisher)
+
+    peer.advertise(EventPacket, '/camera/events', ReliabilityPolicy.RELIABLE)
+    assert peer.spin_until(lambda: 'no messages come' in status(peer).message), status(peer)
+
+    info = CameraInfo(width=64, height=48, distortion_model='plumb_bob', d=[0.0] * 5)
+    info.k = [50.0, 0.0, 32.0, 0.0, 50.0, 24.0, 0.0, 0.0, 1.0]
+    calibration = peer.node.create_publisher(CameraInfo, 'camera_info', 1)
+    assert peer.spin_until(calibration.get_subscription_count)
+    calibration.publish(info)
+    publish(peer, packets(beacon_events(2 * TEXT, NS_PER_S, 42, 24)))
+    assert peer.spin_until(lambda: any(message.bearings for message in peer.heard['/beacon_node/bearings']))
+    bearing = next(message for message in peer.heard['/beacon_node/bearings'] if message.bearings).bearings[0]
+    assert bearing.has_bearing and bearing.azimuth_rad == pytest.approx(np.arctan(10.0 / 50.0), abs=0.02)
+    assert peer.spin_until(lambda: 'beacons confirmed' in status(peer).message), status(peer)
+    text = peer.heard['/beacon_node/text'][-1]
+    assert len(text.codes) == 5 and text.first_index > 20
+
+    node.process.send_signal(signal.SIGINT)
+    node.process.send_signal(signal.SIGINT)
+    assert node.exit_code() == 0, node.output()
+    assert 'Traceback' not in node.output()
+
+
+@pytest.mark.parametrize('signals', [(signal.SIGTERM,), (signal.SIGINT, signal.SIGINT, signal.SIGTERM)])
+def test_it_ends_cleanly(start: Callable[..., NodeProcess], signals: tuple[signal.Signals, ...]) -> None:
+    node = start()
+    node.wait_for('waiting for events on /events')
+    for number in signals:
+        node.process.send_signal(number)
+        time.sleep(0.05)
+    assert node.exit_code() == 0, node.output()
+    assert 'Traceback' not in node.output()
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'line'),
+    [
+        (['-p', 'index_threshold:=-1.0'], 'index_threshold = -1.0: must lie in [0, ∞]'),
+        (['-p', 'bit_rates:=[504.0, 19.0]'], 'bit_rates = 19.0: must lie in [20, 10000] bps'),
+        (['-p', 'publish_rate_hz:=fast'], "publish_rate_hz = 'fast': must be a number"),
+        (['-p', 'camera_info_file:=/no/such/file.yaml'], '/no/such/file.yaml'),
+        (['-p', 'reserved_candidate_slots:=17'], 'reserved_candidate_slots = 17: more than candidate_slots = 16'),
+    ],
+)
+def test_a_wrong_value_is_refused_in_one_line(
+    start: Callable[..., NodeProcess], arguments: list[str], line: str
+) -> None:
+    node = start(*arguments)
+    assert node.exit_code(START_TIMEOUT_S) == 2
+    (written,) = [text for text in node.output().splitlines() if text.strip()]
+    assert line in written
