@@ -64,6 +64,14 @@ class ReceivedCharacter:
 class _Slot:
     demodulator: Demodulator
     record: ParityRecord
+    read_to_ns: int | None
+    """End of the last character that was given out, in this turn or the ones before it."""
+
+    def judge(self, track_id: int, characters: list[Character]) -> list[ReceivedCharacter]:
+        for character in characters:
+            self.record.push(character)
+            self.read_to_ns = self.record.end_of(character)
+        return [ReceivedCharacter(track_id, character) for character in characters]
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +80,7 @@ class _Tried:
 
     ended_ns: int
     record: ParityRecord
+    read_to_ns: int | None
 
 
 _NO_TIMES: Times = np.empty(0, np.int64)
@@ -103,7 +112,7 @@ class CandidateSlots:
             t_ns: the hop's time (ns).
             backlog: returns a track's buffered events before ``t_ns``: times (ns, ``(n,)`` int64) and polarities
                 (``(n,)`` int8).  A slot that is given starts from there; of a track that has had one, from the end
-                of that turn, so that nothing is read twice.
+                of the last character that was read, so that none is given out twice.
 
         Returns:
             What the backlogs of the slots given now read, in order of time.
@@ -136,20 +145,20 @@ class CandidateSlots:
         for track_id, slot in self._slots.items():
             track = events.get(track_id)
             t_ns, polarity = (_NO_TIMES, _NO_POLARITIES) if track is None else (track.t_ns, track.polarity)
-            received += _judged(track_id, slot, slot.demodulator.push(t_ns, polarity, t_end_ns))
+            received += slot.judge(track_id, slot.demodulator.push(t_ns, polarity, t_end_ns))
         return sorted(received, key=_by_time)
 
     def forget(self, track_id: int) -> list[ReceivedCharacter]:
         """Drop a lost track; return the last characters of its demodulator, if it has one."""
         self._tried.pop(track_id, None)
         slot = self._slots.pop(track_id, None)
-        return [] if slot is None else _judged(track_id, slot, slot.demodulator.flush())
+        return [] if slot is None else slot.judge(track_id, slot.demodulator.flush())
 
     def flush(self) -> list[ReceivedCharacter]:
         """Return the last characters of all demodulators at the end of a stream, in order of time."""
         received = []
         for track_id, slot in self._slots.items():
-            received += _judged(track_id, slot, slot.demodulator.flush())
+            received += slot.judge(track_id, slot.demodulator.flush())
         return sorted(received, key=_by_time)
 
     @property
@@ -216,20 +225,16 @@ class CandidateSlots:
             self._end_turn(track_id, t_ns)
 
     def _end_turn(self, track_id: int, t_ns: int) -> None:
-        self._tried[track_id] = _Tried(t_ns, self._slots.pop(track_id).record)
+        slot = self._slots.pop(track_id)
+        self._tried[track_id] = _Tried(t_ns, slot.record, slot.read_to_ns)
 
     def _give(self, track_id: int, t_ns: int, times: Times, polarity: Polarities) -> list[ReceivedCharacter]:
         tried = self._tried.pop(track_id, None)
-        first = 0 if tried is None else int(np.searchsorted(times, tried.ended_ns, 'left'))
-        slot = self._slots[track_id] = _Slot(self._make_demodulator(self._p), ParityRecord(self._p))
+        read_to_ns = None if tried is None else tried.read_to_ns
+        first = 0 if read_to_ns is None else int(np.searchsorted(times, read_to_ns, 'left'))
+        slot = self._slots[track_id] = _Slot(self._make_demodulator(self._p), ParityRecord(self._p), read_to_ns)
         slot.record.advance(t_ns, quiet=False)
-        return _judged(track_id, slot, slot.demodulator.push(times[first:], polarity[first:], t_ns))
-
-
-def _judged(track_id: int, slot: _Slot, characters: list[Character]) -> list[ReceivedCharacter]:
-    for character in characters:
-        slot.record.push(character)
-    return [ReceivedCharacter(track_id, character) for character in characters]
+        return slot.judge(track_id, slot.demodulator.push(times[first:], polarity[first:], t_ns))
 
 
 def _by_time(received: ReceivedCharacter) -> tuple[int, int]:

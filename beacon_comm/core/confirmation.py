@@ -119,7 +119,7 @@ class ParityRecord:
         if self._vouched_for():
             self.confirmed = True
             self._hungry_ns = 0
-            self.confirmed_at_ns = character.t_ns + round(self._layout.duration_ns(character.bit_rate_bps))
+            self.confirmed_at_ns = self.end_of(character)
             return Verdict.CONFIRMED
         return Verdict.NONE
 
@@ -138,6 +138,10 @@ class ParityRecord:
         self.confirmed = False
         self.demoted = True
         return Verdict.STARVED
+
+    def end_of(self, character: Character) -> int:
+        """Return the nominal end of a character (ns, sensor clock)."""
+        return character.t_ns + round(self._layout.duration_ns(character.bit_rate_bps))
 
     def _count(self, character: Character) -> None:
         status = character.status
