@@ -5,6 +5,8 @@ Fields in wire order.  ``event_array_msgs/msg/EventArray`` is the former name of
 
 from __future__ import annotations
 
+from beacon_comm.wire.stream import PACKET_TYPES, is_event_array_type
+
 PACKET_TYPE = 'event_camera_msgs/msg/EventPacket'
 
 _PACKET = """std_msgs/Header header
@@ -37,18 +39,9 @@ _TIME = """int32 sec
 uint32 nanosec
 """
 
-PACKET_SHAPED = (PACKET_TYPE, 'event_array_msgs/msg/EventArray')
-ARRAY_SHAPED = ('dvs_msgs/msg/EventArray', 'prophesee_event_msgs/msg/EventArray', 'dv_ros2_msgs/msg/EventArray')
-
-
-def is_array_shaped(message_type: str) -> bool:
-    """Return whether messages of this type hold ``Event[]``; every ``EventArray`` but the old packet's does."""
-    return message_type.endswith('/msg/EventArray') and message_type not in PACKET_SHAPED
-
-
 def is_event_type(message_type: str) -> bool:
     """Return whether messages of this type hold events."""
-    return message_type in PACKET_SHAPED or is_array_shaped(message_type)
+    return message_type in PACKET_TYPES or is_event_array_type(message_type)
 
 
 def definitions(message_type: str) -> dict[str, str]:
@@ -58,9 +51,9 @@ def definitions(message_type: str) -> dict[str, str]:
         KeyError: not an event message.
     """
     needed = {'std_msgs/msg/Header': _HEADER, 'builtin_interfaces/msg/Time': _TIME}
-    if message_type in PACKET_SHAPED:
+    if message_type in PACKET_TYPES:
         return {message_type: _PACKET, **needed}
-    if is_array_shaped(message_type):
+    if is_event_array_type(message_type):
         package = message_type.partition('/')[0]
         return {message_type: _ARRAY, f'{package}/msg/Event': _EVENT, **needed}
     raise KeyError(message_type)

@@ -14,7 +14,8 @@ import struct
 
 import numpy as np
 
-from beacon_comm.recordings.interfaces import PACKET_SHAPED, is_array_shaped
+from beacon_comm.recordings.interfaces import is_event_type
+from beacon_comm.wire.stream import is_event_array_type
 
 _EVENT_ROS1 = np.dtype([('x', '<u2'), ('y', '<u2'), ('sec', '<u4'), ('nanosec', '<u4'), ('polarity', 'u1')])
 # An event of the CDR array, seen from its y: x comes in the two bytes before the next 16-byte step.
@@ -83,7 +84,7 @@ def event_message_to_cdr(raw: bytes | memoryview, message_type: str) -> bytes:
         ValueError, struct.error: the bytes are not such a message.
         KeyError: not an event message.
     """
-    if message_type not in PACKET_SHAPED and not is_array_shaped(message_type):
+    if not is_event_type(message_type):
         raise KeyError(message_type)
     source, cdr = _Ros1(raw), _Cdr()
     _, sec, nanosec, length = source.take('IIII')
@@ -92,7 +93,7 @@ def event_message_to_cdr(raw: bytes | memoryview, message_type: str) -> bytes:
     cdr.put_string(source.take_bytes(length))
     for value in source.take('II'):  # height, width
         cdr.put('I', value)
-    if is_array_shaped(message_type):
+    if is_event_array_type(message_type):
         (count,) = source.take('I')
         cdr.put_sequence(count, _events_to_cdr(source.take_bytes(count * _EVENT_ROS1.itemsize), count))
         return cdr.finished()

@@ -114,8 +114,11 @@ def read_truth(path: str | Path) -> SceneTruth:
     file = path / TRUTH_NAME if path.is_dir() else path
     try:
         content = json.loads(file.read_text(encoding='utf-8'))
+    except (OSError, ValueError) as error:
+        raise RecordingError(f'{file}: cannot be read ({error})') from error
+    try:
         if content['schema'] != _SCHEMA:
-            raise RecordingError(f'{file}: schema {content["schema"]}, not {_SCHEMA}')
+            raise ValueError(f'schema {content["schema"]}, not {_SCHEMA}')
         width, height = content['sensor']
         return SceneTruth(
             width,
@@ -125,8 +128,6 @@ def read_truth(path: str | Path) -> SceneTruth:
             content['stamp_start_ns'],
             tuple(_beacon(entry, width, height) for entry in content['beacons']),
         )
-    except OSError as error:
-        raise RecordingError(f'{file}: cannot be read ({error.strerror})') from error
     except (ValueError, KeyError, TypeError) as error:
         raise RecordingError(f'{file}: not the truth of a scene ({error!r})') from error
 
