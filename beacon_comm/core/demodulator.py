@@ -1,4 +1,4 @@
-"""Demodulators: events of one blob in, characters out (section III-B.3 to III-B.5)."""
+"""Demodulators: what a candidate slot runs; events of one blob in, characters out (section III-B.3 to III-B.5)."""
 
 from __future__ import annotations
 
@@ -8,10 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beacon_comm.core.character import Character
+from beacon_comm.core.parameters import Parameters
+from beacon_comm.core.rate_bank import RateBank
+from beacon_comm.core.threshold import ThresholdDemodulator
+
+__all__ = ['Demodulator', 'RateBank', 'ThresholdDemodulator', 'make_demodulator']
 
 
 class Demodulator(Protocol):
-    """What a candidate slot runs: events of one blob in, characters out."""
+    """Events of one blob in, characters out."""
 
     def push(self, t_ns: NDArray[np.int64], polarity: NDArray[np.int8], t_end_ns: int) -> list[Character]:
         """Take the next events and return the characters that are decided by now, in order.
@@ -31,3 +36,10 @@ class Demodulator(Protocol):
     def bit_rate_bps(self) -> float | None:
         """The settled bit rate (bit/s), None before."""
         ...
+
+
+def make_demodulator(parameters: Parameters) -> Demodulator:
+    """Return a new demodulator for a candidate slot: for one listed rate that rate's, for several a bank."""
+    if len(parameters.bit_rates) == 1:
+        return ThresholdDemodulator(parameters.bit_rates[0], parameters)
+    return RateBank(parameters)

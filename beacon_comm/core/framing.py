@@ -14,6 +14,7 @@ A *frame* as an integer holds the first sent bit as its most significant bit.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,6 +73,11 @@ class CharacterFrame:
         """Bits of a whole character, start to last stop bit (11 by default)."""
         return 1 + self.data_bits + self.parity_bits + self.stop_bits
 
+    @property
+    def most_falls(self) -> int:
+        """Most falling edges that one character can have, its start edge among them (5 by default)."""
+        return 1 + (self.data_bits + self.parity_bits) // 2
+
     def duration_ns(self, bit_rate_bps: float) -> float:
         """Return how long a character takes (ns): the paper's T, ``length / f``."""
         return self.length * NS_PER_S / bit_rate_bps
@@ -110,7 +116,8 @@ class CharacterFrame:
         Raises:
             FramingError: a character does not fit into the data bits; the text names it and its position.
         """
-        codes = np.array([self._code_of(symbol, position) for position, symbol in enumerate(text)], np.int64)
+        symbols: Iterable[str | int] = text
+        codes = np.array([self._code_of(symbol, position) for position, symbol in enumerate(symbols)], np.int64)
         frames = np.array([self.frame_of(code) for code in range(1 << self.data_bits)], np.int64)[codes]
         shifts = np.arange(self.length - 1, -1, -1)
         return (frames[:, None] >> shifts & 1).astype(np.uint8).ravel()
