@@ -99,6 +99,7 @@ def test_everything_is_declared_with_its_range_and_read_only() -> None:
         ({'bit_rates': []}, r'bit_rates = \[\]: must be a list of at least one'),
         ({'use_camera_info': 1}, 'use_camera_info = 1: must be true or false'),
         ({'index_threshold': math.nan}, 'index_threshold = nan: must be a number'),
+        ({'candidate_slots': 2, 'reserved_candidate_slots': 3}, 'reserved_candidate_slots = 3: more than'),
         ({'qos_depth': 1.5}, 'qos_depth = 1.5: must be a whole number'),
     ],
 )

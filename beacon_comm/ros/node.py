@@ -30,6 +30,11 @@ class StopSignal:
         """From now on a signal interrupts nothing."""
         self._starting = False
 
+    def ignore(self) -> None:
+        """Let no further signal cut the end short: Python itself would die of one once it takes its handlers down."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
+
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self.requested = True
         if self._starting:
@@ -45,8 +50,7 @@ def main(args: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 0
     finally:
-        stop.started()
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        stop.ignore()
 
 
 def _run(args: Sequence[str] | None, stop: StopSignal) -> int:
@@ -79,7 +83,7 @@ def _run(args: Sequence[str] | None, stop: StopSignal) -> int:
     except ExternalShutdownException:
         pass
     finally:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        stop.ignore()
         if node is not None:
             node.close()
             node.destroy_node()
