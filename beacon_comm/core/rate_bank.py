@@ -7,10 +7,11 @@ number of characters would not do, since a fast rate reads several short frames 
     504 bps    │    ok     │    ok     │    ok     │    ok        4 characters, all of the time
     3125 bps   │ok│   │ok│  │x│  │ok│  │ok│   │x│    │ok│         5 characters, less than half of the time
 
-A rate is settled when 8 of its last 10 characters are ok and over their span no other rate explains more.  Where its
-ok characters cover three quarters of that span there is no room for another rate, and it is settled at once.
-Otherwise (a beacon with pauses between its characters, or a slow signal read too fast) it waits until every slower
-rate has had as many characters, or the time for 15.
+A rate is settled when 8 of its last 10 characters are ok and over their span no other rate has more for it: the time
+it explains, less twice the time of its characters that are not ok.  Where its ok characters cover three quarters of
+that span there is no room for another rate, and it is settled at once.  Otherwise (a beacon with pauses between its
+characters, or a slow signal read too fast) it waits until every slower rate has had as many characters, or the time
+for 15.
 
 If nothing is settled after 15 characters of the slowest rate, those of the rate that explains most are given out all
 the same, so that the parity record can judge them, and the trial goes on.
@@ -29,7 +30,13 @@ from numpy.typing import NDArray
 from beacon_comm.core.character import Character, Status
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.parameters import Parameters
-from beacon_comm.core.threshold import Reading, ThresholdDemodulator, explained_ns
+from beacon_comm.core.threshold import (
+    GivenOnce,
+    Reading,
+    ThresholdDemodulator,
+    covered_ns,
+    explained_ns,
+)
 
 SETTLING_CHARACTERS = 10
 """A rate is judged by so many last characters …"""
@@ -39,6 +46,9 @@ SETTLING_OK = 8
 
 FULL_SHARE = 0.75
 """Ok characters over so much of the time leave no room for another rate."""
+
+CONTRADICTION_WEIGHT = 2
+"""Time covered by characters that are not ok counts so many times against a rate."""
 
 HELD_CHARACTERS = 15
 """Nothing is held for longer than so many characters of the slowest rate."""
@@ -82,18 +92,25 @@ class _Rate:
         return self.last[0].span.start_ns, self.last[-1].span.stop_ns
 
     def merit(self, start_ns: int, stop_ns: int) -> tuple[int, float]:
-        """Return the time explained between two times (ns); for rates alike in that, how well the clock agrees."""
+        """Return what speaks for the rate between two times (ns); for rates alike in that, how well the clock agrees.
+
+        A character that is not ok speaks against it twice as much as an ok one for it: a slow rate reads a few frames
+        out of a fast signal with pauses by chance, and each of them is long.
+        """
         first = len(self.held)
         while first and self.held[first - 1].span.stop_ns > start_ns:
             first -= 1
         spans_ns = [reading.span.stop_ns - reading.span.start_ns for reading in self.last]
         clock_error = abs(statistics.median(spans_ns) / self.duration_ns - 1.0) if spans_ns else 1.0
-        return explained_ns(self.held[first:], start_ns, stop_ns), -clock_error
+        overlapping = self.held[first:]
+        explained = explained_ns(overlapping, start_ns, stop_ns)
+        contradicting = covered_ns(overlapping, start_ns, stop_ns) - explained
+        return explained - CONTRADICTION_WEIGHT * contradicting, -clock_error
 
-    @property
-    def whole_merit(self) -> tuple[int, int]:
-        """All the time explained (ns), and the number of readings."""
-        return sum(r.span.stop_ns - r.span.start_ns for r in self.held if r.character.status == Status.OK), len(self.held)
+    def merit_since(self, start_ns: int) -> tuple[int, int]:
+        """Return the time explained from ``start_ns`` on (ns); for rates alike in that, the number of characters."""
+        fresh = [reading for reading in self.held if reading.span.start_ns >= start_ns]
+        return explained_ns(fresh, start_ns, fresh[-1].span.stop_ns) if fresh else 0, len(fresh)
 
 
 class RateBank:
@@ -110,6 +127,7 @@ class RateBank:
         self._longest_ns = max(rate.patience_ns for rate in self._rates)
         self._decided: list[tuple[_Rate, Reading]] = []
         self._held_since_ns: int | None = None
+        self._given = GivenOnce()
 
     @property
     def bit_rate_bps(self) -> float | None:
@@ -119,7 +137,7 @@ class RateBank:
     def push(self, t_ns: NDArray[np.int64], polarity: NDArray[np.int8], t_end_ns: int) -> list[Character]:
         """Take the next events; see :class:`beacon_comm.core.demodulator.Demodulator`."""
         if self._settled is not None:
-            return self._settled.push(t_ns, polarity, t_end_ns)
+            return self._given.take(self._settled.push_readings(t_ns, polarity, t_end_ns))
         for rate in self._rates:
             self._decided += [(rate, reading) for reading in rate.demodulator.push_readings(t_ns, polarity, t_end_ns)]
         return self._weigh(t_end_ns)
@@ -127,7 +145,7 @@ class RateBank:
     def flush(self) -> list[Character]:
         """End the stream; if no rate is settled, give the characters of the one that explains most out."""
         if self._settled is not None:
-            return self._settled.flush()
+            return self._given.take(self._settled.flush_readings())
         for rate in self._rates:
             self._decided += [(rate, reading) for reading in rate.demodulator.flush_readings()]
         return self._weigh(None)
@@ -167,19 +185,20 @@ class RateBank:
         )
 
     def _settle(self, rate: _Rate) -> list[Character]:
-        """Keep ``rate``; return all its characters that are decided."""
+        """Keep ``rate``; return all its characters that are decided and were not given out before."""
         self._settled = rate.demodulator
         readings = rate.held + [reading for other, reading in self._decided if other is rate]
-        self._rates, self._decided = [], []
-        return self._settled.give_once(readings)
+        self._rates, self._decided, self._held_since_ns = [], [], None
+        return self._given.take(readings)
 
     def _give_best(self) -> list[Character]:
         """Stop holding; return the characters of the rate that explains most, and keep it if it passes."""
-        best = max(self._rates, key=lambda rate: rate.whole_merit)
+        since_ns = 0 if self._held_since_ns is None else self._held_since_ns
+        best = max(self._rates, key=lambda rate: rate.merit_since(since_ns))
         if best.passes:
             return self._settle(best)
-        characters = best.demodulator.give_once(best.held)
+        characters = self._given.take(best.held)
         for rate in self._rates:
-            rate.held.clear()
+            rate.held = rate.last  # what it is judged by; given out before
         self._held_since_ns = None
         return characters

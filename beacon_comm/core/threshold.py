@@ -48,13 +48,30 @@ class Reading:
     decided_ns: int
 
 
+def covered_ns(readings: Iterable[Reading], start_ns: int, stop_ns: int) -> int:
+    """Return the time between two times that characters cover (ns)."""
+    return sum(max(0, min(r.span.stop_ns, stop_ns) - max(r.span.start_ns, start_ns)) for r in readings)
+
+
 def explained_ns(readings: Iterable[Reading], start_ns: int, stop_ns: int) -> int:
     """Return the time between two times that ok characters cover (ns)."""
-    total = 0
-    for reading in readings:
-        if reading.character.status == Status.OK:
-            total += max(0, min(reading.span.stop_ns, stop_ns) - max(reading.span.start_ns, start_ns))
-    return total
+    return covered_ns((r for r in readings if r.character.status == Status.OK), start_ns, stop_ns)
+
+
+class GivenOnce:
+    """Passes readings on, but not those of a time that was given out before."""
+
+    def __init__(self) -> None:
+        self._until_ns: int | None = None
+
+    def take(self, readings: Iterable[Reading]) -> list[Character]:
+        """Return the characters of the readings that do not begin before the last one given ended."""
+        characters = []
+        for reading in readings:
+            if self._until_ns is None or reading.span.start_ns >= self._until_ns:
+                characters.append(reading.character)
+                self._until_ns = reading.span.stop_ns
+        return characters
 
 
 class ThresholdDemodulator:
@@ -75,7 +92,7 @@ class ThresholdDemodulator:
         self._record = EdgeRecord()
         self._recent: list[deque[Reading]] = [deque(maxlen=REMEMBERED_CHARACTERS) for _ in range(trials)]
         self._leader = 0
-        self._given_until_ns: int | None = None
+        self._given = GivenOnce()
 
     @property
     def bit_rate_bps(self) -> float:
@@ -84,11 +101,11 @@ class ThresholdDemodulator:
 
     def push(self, t_ns: NDArray[np.int64], polarity: NDArray[np.int8], t_end_ns: int) -> list[Character]:
         """Take the next events; see :class:`beacon_comm.core.demodulator.Demodulator`."""
-        return self.give_once(self.push_readings(t_ns, polarity, t_end_ns))
+        return self._given.take(self.push_readings(t_ns, polarity, t_end_ns))
 
     def flush(self) -> list[Character]:
         """End the stream; see :class:`beacon_comm.core.demodulator.Demodulator`."""
-        return self.give_once(self.flush_readings())
+        return self._given.take(self.flush_readings())
 
     def push_readings(self, t_ns: NDArray[np.int64], polarity: NDArray[np.int8], t_end_ns: int) -> list[Reading]:
         """Take the next events; return readings in order of decision.
@@ -106,15 +123,6 @@ class ThresholdDemodulator:
     def flush_readings(self) -> list[Reading]:
         """End the stream; return readings as :meth:`push_readings` does."""
         return self._read(self._synchroniser.flush())
-
-    def give_once(self, readings: list[Reading]) -> list[Character]:
-        """Return the characters of readings, without those of a time that characters were returned for before."""
-        characters = []
-        for reading in readings:
-            if self._given_until_ns is None or reading.span.start_ns >= self._given_until_ns:
-                characters.append(reading.character)
-                self._given_until_ns = reading.span.stop_ns
-        return characters
 
     def _read(self, spans: list[Span]) -> list[Reading]:
         readings: list[Reading] = []
