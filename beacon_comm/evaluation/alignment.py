@@ -43,7 +43,10 @@ STREAM_NATS = math.log(1000.0)
 # Decoded characters that vote together; more would only cost time.
 LONGEST_WINDOW = 1500
 SHORTEST_WINDOW = 256
+# Best votes that are looked into, and how many of them in vain before a window is given up.
 CANDIDATES = 24
+IN_VAIN = 8
+REFINING_TURNS = 18
 _NOWHERE = np.empty(0, np.int64)
 
 Floats = NDArray[np.float64]
@@ -157,13 +160,13 @@ def _claim(stream: _Stream, begin: float, end: float, tolerance: float) -> list[
     """Take the window's best lines that carry enough evidence; their characters are free no more."""
     lines, tried = _votes(stream, begin, end, tolerance)
     claimed: list[tuple[_Line, int, int, float]] = []
-    for line in lines:
+    for tries, line in enumerate(lines):
         line = _refine(stream, line)
         first, last, nats = _evidence(stream, line)
         nats -= math.log(tried)
         if nats < SENDING_NATS:
-            if claimed:
-                break  # the rest was overtaken by what is claimed: vote again
+            if claimed or tries >= IN_VAIN:
+                break  # where some were claimed, they have overtaken the rest: vote again
             continue
         claimed.append((line, first, last, nats))
         a, b = np.searchsorted(stream.t, line.start + line.period * np.array((first - 0.5, last + 0.5)))
@@ -209,24 +212,26 @@ def _votes(stream: _Stream, begin: float, end: float, tolerance: float) -> tuple
 
 
 def _refine(stream: _Stream, line: _Line) -> _Line:
-    """Fit the line to the right characters near it, from the densest stretch outwards."""
+    """Fit the line to the right characters near it, from the stretch that fits best outwards."""
     n = len(stream.truth)
-    reach: float | None = None
-    middle = 0.0
-    for turn in range(12):
+    middle = reach = -1.0
+    for turn in range(REFINING_TURNS):
         rows, k = stream.near(line, 0.375 if turn < 3 else MATCH_DISTANCE)
         right = stream.codes[rows] == stream.truth[k]
-        rows, k = rows[right], k[right]
-        if not len(rows):
+        if not right.any():
             return line
-        if reach is None:
-            middle = float(np.median(k))
-            reach = min(float(n), LONGEST_WINDOW / 2.0)
-        inside = np.abs(k - middle) <= reach
+        if reach < 0.0:
+            a, b, _ = _best_stretch(np.where(right, 2.0, -1.0))
+            middle = (k[a] + k[b - 1]) / 2.0
+            reach = max(float(k[b - 1] - k[a]), 8.0) / 2.0
+        inside = right & (np.abs(k - middle) <= reach)
         if inside.sum() < 2:
-            inside[:] = True
+            inside = right
+        before, line = line, _fit(stream.t[rows[inside]], k[inside].astype(np.float64), line)
+        moved = abs(line.start - before.start) + n * abs(line.period - before.period)
+        if turn >= 3 and reach > n and moved < 1e-3:
+            break
         reach *= 1.5
-        line = _fit(stream.t[rows[inside]], k[inside].astype(np.float64), line)
     return line
 
 
@@ -236,8 +241,8 @@ def _fit(t: Floats, k: Floats, line: _Line) -> _Line:
     for _ in range(3):
         period = line.period
         if keep.sum() >= 4 and np.ptp(k[keep]) >= 4:
-            slope = float(np.polyfit(k[keep] - k[keep].mean(), t[keep], 1)[0])
-            period = min(max(slope, 1.0 - WIDE_RATES), 1.0 + WIDE_RATES)
+            arm = k[keep] - k[keep].mean()
+            period = min(max(float(arm @ t[keep] / (arm @ arm)), 1.0 - WIDE_RATES), 1.0 + WIDE_RATES)
         line = _Line(float(np.median(t[keep] - k[keep] * period)), period)
         residual = np.abs(t - line.start - k * period)
         keep = residual <= max(3.0 * float(np.median(residual[keep])), 0.02)

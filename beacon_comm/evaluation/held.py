@@ -69,7 +69,8 @@ def held_characters(
     inside &= due_ns + last_change * bit_ns <= limits_ns[1] + slack_ns
     if signal is not None and inside.any():
         first_bit, stop_bit = _followed_bits(sending, bits, inside, signal)
-        inside &= (k * frame_bits >= first_bit) & (k * frame_bits + last_change <= stop_bit)
+        # The events of the last change come in the bit after it.
+        inside &= (k * frame_bits >= first_bit) & (k * frame_bits + last_change + 1 <= stop_bit)
     held = np.flatnonzero(inside)
     return (int(held[0]), int(held[-1]) + 1) if len(held) else (0, 0)
 

@@ -30,6 +30,7 @@ from beacon_comm.core.character import Character, Status
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.evaluation.alignment import MATCH_DISTANCE, Sending, find_sendings
 from beacon_comm.evaluation.held import Signal, held_characters
+from beacon_comm.evaluation.repeats import with_repeats
 
 NOT_FOUND_MESSAGE_ACCURACY = 0.0
 NOT_FOUND_BIT_ACCURACY = 0.5
@@ -98,6 +99,12 @@ class Transmission:
         return self.start_ns is not None
 
     @property
+    def open_ended(self) -> bool:
+        """Whether its first or its last character is missing: the sending may have begun later, or ended earlier."""
+        outermost = {self.first, self.first + self.characters - 1}
+        return any(error.received is None and error.k in outermost for error in self.errors)
+
+    @property
     def message_accuracy(self) -> float:
         """1 - (wrong + inserted) / characters, 0 at least."""
         if not self.found:
@@ -161,7 +168,7 @@ def score(
     codes = np.array([character.code for character in ordered], np.int64)
     sent = np.array([ord(symbol) for symbol in truth], np.int64)
     bit_rate_bps = float(np.median([character.bit_rate_bps for character in ordered]))
-    sendings = find_sendings(t_ns, codes, sent, bit_rate_bps, frame.length)
+    sendings = with_repeats(find_sendings(t_ns, codes, sent, bit_rate_bps, frame.length), len(truth))
     if not sendings:
         return ()
     transmissions = []

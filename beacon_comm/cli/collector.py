@@ -1,0 +1,109 @@
+"""Gathers what a receiver gives out over a recording: one account a track, kept when the track is lost."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+
+from beacon_comm.core.candidates import BeaconState
+from beacon_comm.core.character import Character
+from beacon_comm.core.receiver import BeaconSnapshot, Output, Receiver
+from beacon_comm.evaluation.result import BeaconResult, PathPoint
+
+
+@dataclass(slots=True)
+class _Account:
+    track_id: int
+    state: BeaconState = BeaconState.WAITING
+    confirmed_at_ns: int | None = None
+    bit_rate_bps: float | None = None
+    azimuth_rad: float | None = None
+    elevation_rad: float | None = None
+    path: list[PathPoint] = field(default_factory=list)
+    characters: list[Character] = field(default_factory=list)
+
+    @property
+    def silent(self) -> bool:
+        return not self.characters and self.confirmed_at_ns is None
+
+    def result(self) -> BeaconResult:
+        return BeaconResult(
+            track_id=self.track_id,
+            state=self.state,
+            confirmed_at_ns=self.confirmed_at_ns,
+            bit_rate_bps=self.bit_rate_bps,
+            azimuth_rad=self.azimuth_rad,
+            elevation_rad=self.elevation_rad,
+            path=tuple(self.path),
+            characters=tuple(sorted(self.characters, key=lambda character: character.t_ns)),
+        )
+
+
+class Collector:
+    """Accounts of all tracks, in recording time.
+
+    Attributes:
+        origin_ns: sensor time at recording time 0; changes where a sensor is restarted.
+    """
+
+    def __init__(self, origin_ns: int = 0) -> None:
+        self.origin_ns = origin_ns
+        self._accounts: dict[int, _Account] = {}
+
+    def take(self, output: Output, receiver: Receiver) -> None:
+        """Take what a push, a flush or a restart gave."""
+        for received in output.characters:
+            character = received.character
+            self._account(received.track_id).characters.append(
+                replace(character, t_ns=character.t_ns - self.origin_ns)
+            )
+        for snapshot in output.lost:
+            self._note(snapshot)
+        if output.confirmed_changed:
+            for snapshot in receiver.beacons():
+                self._note(snapshot)
+
+    def sample(self, snapshots: Iterable[BeaconSnapshot]) -> None:
+        """Take all tracks at one instant: a point of their paths."""
+        for snapshot in snapshots:
+            t_ns = snapshot.t_ns - self.origin_ns
+            point = PathPoint(t_ns, snapshot.x_px, snapshot.y_px, snapshot.extent_px)
+            path = self._note(snapshot).path
+            if not path or path[-1].t_ns < t_ns:
+                path.append(point)
+
+    def beacons(self) -> tuple[tuple[BeaconResult, ...], int]:
+        """Return the tracks that gave characters or were confirmed, by label, and the number of the others."""
+        accounts = [account for _, account in sorted(self._accounts.items())]
+        speaking = tuple(account.result() for account in accounts if not account.silent)
+        return speaking, len(accounts) - len(speaking)
+
+    def whole_signal(self) -> BeaconResult:
+        """Return everything as one beacon: a recording without pixels holds no other."""
+        accounts = [account for _, account in sorted(self._accounts.items())]
+        if not accounts:
+            return _Account(track_id=1).result()
+        confirmed_ns = [account.confirmed_at_ns for account in accounts if account.confirmed_at_ns is not None]
+        rates = [account.bit_rate_bps for account in accounts if account.bit_rate_bps is not None]
+        whole = _Account(
+            accounts[0].track_id,
+            accounts[-1].state,
+            min(confirmed_ns, default=None),
+            rates[-1] if rates else None,
+            characters=[character for account in accounts for character in account.characters],
+        )
+        return whole.result()
+
+    def _account(self, track_id: int) -> _Account:
+        return self._accounts.setdefault(track_id, _Account(track_id))
+
+    def _note(self, snapshot: BeaconSnapshot) -> _Account:
+        account = self._account(snapshot.track_id)
+        account.state = snapshot.state
+        if snapshot.bit_rate_bps is not None:
+            account.bit_rate_bps = snapshot.bit_rate_bps
+        if account.confirmed_at_ns is None and snapshot.confirmed_at_ns is not None:
+            account.confirmed_at_ns = snapshot.confirmed_at_ns - self.origin_ns
+        if snapshot.azimuth_rad is not None:
+            account.azimuth_rad, account.elevation_rad = snapshot.azimuth_rad, snapshot.elevation_rad
+        return account

@@ -1,0 +1,134 @@
+"""``beacon_evaluate``: the receiver over recordings, without ROS, and its scores against a known text."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from typing import NoReturn
+
+from beacon_comm.cli.parameter_arguments import add_parameter_arguments, parameters_from
+from beacon_comm.core.errors import BeaconCommError, RecordingError
+from beacon_comm.core.framing import CharacterFrame
+from beacon_comm.core.parameters import Parameters
+from beacon_comm.evaluation.report import published_table, recordings_table, scores_table, texts_table
+from beacon_comm.evaluation.result import RecordingResult
+from beacon_comm.evaluation.result_json import write_json
+from beacon_comm.evaluation.truth import load_truth
+
+NAME = 'beacon_evaluate'
+EXIT_OK = 0
+EXIT_ERROR = 2
+
+
+class OneLineParser(argparse.ArgumentParser):
+    """Parser whose errors are one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the error without the usage, and exit with 2."""
+        self.exit(EXIT_ERROR, f'{self.prog}: {message}\n')
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Return the command line's parser."""
+    parser = OneLineParser(
+        prog=NAME,
+        description='Run the receiver over recordings as fast as it goes, and score what it decodes.',
+        epilog='Exit code 0: all was read; 2: an error, or something could not be read (the rest is shown).',
+    )
+    parser.add_argument(
+        'recordings', metavar='RECORDING', nargs='+', help="a bag (rosbag2, ROS 1) or a .mat file of one beacon's events"
+    )
+    parser.add_argument(
+        '--truth', metavar='TEXT', help='what was sent: sonnet18, a text file (every byte of it counts), or the text'
+    )
+    add_parameter_arguments(parser)
+    parser.add_argument('--camera', metavar='YAML', help='calibration of the camera, for bearings')
+    parser.add_argument('--json', metavar='FILE', help='write the results there, too (docs/evaluation.md)')
+    parser.add_argument('--topic', help='event topic of the bags (default: the only one)')
+    parser.add_argument('--start', type=float, default=0.0, metavar='S', help='seconds of each recording to leave out')
+    parser.add_argument('--duration', type=float, metavar='S', help='seconds to evaluate (default: to the end)')
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    arguments = make_parser().parse_args(argv)
+    try:
+        return _run(arguments)
+    except BeaconCommError as error:
+        return _complain(str(error))
+    except KeyboardInterrupt:
+        return _complain('interrupted')
+    except BrokenPipeError:
+        sys.stderr.close()  # the reader has gone: nothing to say, and nobody to say it to
+        return EXIT_ERROR
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    # Imported here: the kernels' libraries take a second, and --help and wrong arguments need none of them.
+    from beacon_comm.cli.offline import Options, evaluate_recording, warm_up
+    from beacon_comm.core.bearing import CameraModel
+
+    if arguments.start < 0.0 or (arguments.duration is not None and arguments.duration <= 0.0):
+        raise RecordingError('--start must not be negative, --duration must be more than 0')
+    parameters, passed_over = parameters_from(arguments)
+    if passed_over:
+        print(f"{NAME}: {arguments.params}: not the receiver's, passed over: {', '.join(passed_over)}", file=sys.stderr)
+    options = Options(
+        parameters,
+        _truth(arguments.truth, parameters),
+        None if arguments.camera is None else CameraModel.from_yaml(arguments.camera),
+        arguments.topic,
+        arguments.start,
+        arguments.duration,
+    )
+    warm_up(parameters)
+    results: list[RecordingResult] = []
+    code = EXIT_OK
+    for recording in arguments.recordings:
+        try:
+            result = evaluate_recording(recording, options)
+        except BeaconCommError as error:
+            code = _complain(str(error))
+            continue
+        results.append(result)
+        if result.problem is not None:
+            code = _complain(result.problem)
+    if results:
+        print_results(results, options.truth is not None)
+        if arguments.json is not None:
+            write_json(arguments.json, results)
+    return code
+
+
+def print_results(results: Sequence[RecordingResult], scored: bool) -> None:
+    """Print the tables of one or several recordings."""
+    print(recordings_table(results))
+    if any(result.beacons for result in results):
+        print('\n' + texts_table(results))
+    if scored and any(beacon.transmissions for result in results for beacon in result.beacons):
+        print('\n' + scores_table(results))
+        published = published_table(results)
+        if published is not None:
+            print("\nThe last transmission beside the paper's figures (section IV, outdoor):\n" + published)
+    elif scored:
+        print('\nNo transmission of the text was found: message accuracy 0, bit accuracy 0.5.')
+
+
+def _truth(argument: str | None, parameters: Parameters) -> str | None:
+    """Return the text; one that cannot have been sent is refused before anything is read."""
+    if argument is None:
+        return None
+    text = load_truth(argument)
+    CharacterFrame.from_parameters(parameters).encode_bits(text)
+    return text
+
+
+def _complain(text: str) -> int:
+    print(f'{NAME}: {" ".join(text.split())}', file=sys.stderr)
+    return EXIT_ERROR
+
+
+if __name__ == '__main__':
+    sys.exit(main())

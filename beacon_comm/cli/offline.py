@@ -1,0 +1,238 @@
+"""The receiver over a recording, as fast as it goes: no ROS, no clock but the events'.
+
+    bag  ──► BagPieces ──► cut every 20 ms ──► Receiver ───────► Collector ──► beacons ──► scores
+    .mat ──► read_mat ───► cut every 100 ms ─► SignalReceiver ──►
+
+All times of the results are recording time: ns since the recording's first event.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from beacon_comm.cli.bag_pieces import BagPieces
+from beacon_comm.cli.collector import Collector
+from beacon_comm.cli.progress import progress
+from beacon_comm.core.bearing import CameraModel
+from beacon_comm.core.errors import RecordingError
+from beacon_comm.core.events import NS_PER_S, EventBatch
+from beacon_comm.core.framing import CharacterFrame, transitions
+from beacon_comm.core.parameters import Parameters
+from beacon_comm.core.receiver import Receiver, SignalReceiver
+from beacon_comm.evaluation.held import Signal
+from beacon_comm.evaluation.near_path import NearPath
+from beacon_comm.evaluation.result import BeaconResult, RecordingResult
+from beacon_comm.evaluation.scoring import Transmission, not_found, score
+from beacon_comm.recordings.bags import open_recording
+from beacon_comm.recordings.mat import read_mat
+
+SAMPLE_NS = 20_000_000
+MAT_BATCH_NS = 100_000_000
+LONGEST_SAMPLED_NS = 60 * NS_PER_S
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """What to evaluate, and how.
+
+    Attributes:
+        parameters: the receiver's.
+        truth: text that was sent, None: no scores.
+        camera: calibration, None: pixels only.
+        topic: event topic of a bag, None: the only one.
+        start_s, duration_s: part of the recording, from its first event (s); duration None: to its end.
+    """
+
+    parameters: Parameters
+    truth: str | None = None
+    camera: CameraModel | None = None
+    topic: str | None = None
+    start_s: float = 0.0
+    duration_s: float | None = None
+
+    @property
+    def window_ns(self) -> tuple[int, int | None]:
+        """Begin and end of the part, recording time (ns)."""
+        begin_ns = round(self.start_s * NS_PER_S)
+        return begin_ns, None if self.duration_s is None else begin_ns + round(self.duration_s * NS_PER_S)
+
+
+def evaluate_recording(path: str, options: Options) -> RecordingResult:
+    """Run the receiver over one recording and score what it decodes.
+
+    Raises:
+        BeaconCommError: nothing of it can be read, or the truth cannot be framed.
+    """
+    if path.lower().endswith('.mat'):
+        return _evaluate_mat(path, options)
+    with open_recording(path) as bag:
+        return _evaluate_bag(path, BagPieces(path, bag, options.topic, options.window_ns), options)
+
+
+def warm_up(parameters: Parameters) -> None:
+    """Compile the kernels on a made-up beacon, so that the first recording's speed is not the compiler's."""
+    bits = CharacterFrame.from_parameters(parameters).encode_bits('Warm up ' * 8)
+    edges_ns, levels = transitions(bits, max(parameters.bit_rates), NS_PER_S)
+    x, y = (grid.ravel().astype(np.uint16) for grid in np.meshgrid(np.arange(5, 10), np.arange(5, 10)))
+    batch = EventBatch(
+        np.tile(x, len(edges_ns)),
+        np.tile(y, len(edges_ns)),
+        np.repeat(np.where(levels > 0, 1, -1), len(x)).astype(np.int8),
+        np.repeat(edges_ns, len(x)),
+        int(edges_ns[-1]) + NS_PER_S // 10,
+    )
+    for receiver in (Receiver(parameters, (16, 16)), SignalReceiver(parameters)):
+        receiver.push(batch)
+        receiver.flush()
+
+
+def _evaluate_mat(path: str, options: Options) -> RecordingResult:
+    """Evaluate a .mat file: it has no pixels, so detection is bypassed, and it is one beacon."""
+    t_ns, polarity = read_mat(path)
+    t_ns = t_ns - t_ns[0]
+    begin_ns, end_ns = options.window_ns
+    part = slice(*np.searchsorted(t_ns, (begin_ns, t_ns[-1] + 1 if end_ns is None else end_ns)))
+    t_ns, polarity = t_ns[part], polarity[part]
+    if not len(t_ns):
+        raise RecordingError(f'{path}: no events in the part asked for, from {options.start_s:g} s on')
+    receiver = SignalReceiver(options.parameters)
+    collector = Collector()
+    begun_s = time.perf_counter()
+    last_ns = int(t_ns[-1])
+    cuts_ns = [*range(int(t_ns[0]) + MAT_BATCH_NS, last_ns, MAT_BATCH_NS), last_ns]
+    stops = [*(int(stop) for stop in np.searchsorted(t_ns, cuts_ns[:-1])), len(t_ns)]
+    start = 0
+    for cut_ns, stop in progress(zip(cuts_ns, stops, strict=True), path, len(cuts_ns)):
+        collector.take(receiver.push_signal(t_ns[start:stop], polarity[start:stop], cut_ns), receiver)
+        start = stop
+    collector.take(receiver.flush(), receiver)
+    collector.sample(receiver.beacons())
+    processing_s = time.perf_counter() - begun_s
+    beacon = collector.whole_signal()
+    if options.truth is not None:
+        transmissions = _scores(beacon, options, (begin_ns, last_ns), Signal(t_ns, polarity))
+        if not transmissions:
+            transmissions = (not_found(options.truth, CharacterFrame.from_parameters(options.parameters)),)
+        beacon = replace(beacon, transmissions=transmissions)
+    return RecordingResult(
+        recording=path,
+        receiver=options.parameters.receiver,
+        events=len(t_ns),
+        duration_ns=last_ns - int(t_ns[0]),
+        processing_s=processing_s,
+        lost_packets=0,
+        skipped_words=0,
+        beacons=(beacon,),
+        silent_tracks=0,
+    )
+
+
+def _evaluate_bag(path: str, pieces: BagPieces, options: Options) -> RecordingResult:
+    collector = Collector()
+    begun_s = time.perf_counter()
+    events, end_ns = _receive(pieces, collector, options)
+    processing_s = time.perf_counter() - begun_s
+    if end_ns is None:
+        raise RecordingError(pieces.problem or f'{path}: no events in the part asked for')
+    begin_ns = options.window_ns[0]
+    beacons, silent = collector.beacons()
+    if options.truth is not None:
+        beacons = _scored_beacons(beacons, pieces, options, (begin_ns, end_ns))
+    return RecordingResult(
+        recording=path,
+        receiver=options.parameters.receiver,
+        events=events,
+        duration_ns=end_ns - begin_ns,
+        processing_s=processing_s,
+        lost_packets=pieces.counts['lost_packets'],
+        skipped_words=pieces.counts['skipped_words'],
+        beacons=beacons,
+        silent_tracks=silent,
+        problem=pieces.problem,
+    )
+
+
+def _receive(pieces: BagPieces, collector: Collector, options: Options) -> tuple[int, int | None]:
+    """Push a bag through a receiver; return the number of events and the end (recording time), None without any."""
+    receiver: Receiver | None = None
+    events = 0
+    reached_ns: int | None = None
+    end_ns: int | None = None
+    for piece in pieces:
+        if receiver is None:
+            if options.camera is not None:
+                options.camera.check_size((piece.width, piece.height))
+            receiver = Receiver(options.parameters, (piece.width, piece.height), options.camera)
+        elif piece.restarted:
+            collector.take(receiver.reset(), receiver)
+            reached_ns = None
+        if piece.resized:
+            collector.take(receiver.resize((piece.width, piece.height)), receiver)
+        collector.origin_ns = piece.origin_ns
+        for batch in cut_batch(piece.batch, SAMPLE_NS, reached_ns):
+            collector.take(receiver.push(batch), receiver)
+            if batch.t_end_ns % SAMPLE_NS == 0:
+                collector.sample(receiver.beacons())
+        events += len(piece.batch)
+        reached_ns = piece.batch.t_end_ns
+        end_ns = reached_ns - piece.origin_ns
+    if receiver is not None:
+        collector.take(receiver.flush(), receiver)
+        collector.sample(receiver.beacons())
+    return events, end_ns
+
+
+def cut_batch(batch: EventBatch, grid_ns: int, reached_ns: int | None) -> Iterator[EventBatch]:
+    """Cut a batch at multiples of ``grid_ns`` of the sensor's time, from ``reached_ns`` (None: its first event) on."""
+    if reached_ns is None:
+        reached_ns = int(batch.t_ns[0]) if len(batch) else batch.t_end_ns
+    # A leap in time is not followed step by step.
+    reached_ns = max(reached_ns, batch.t_end_ns - LONGEST_SAMPLED_NS)
+    start = 0
+    for cut_ns in range((reached_ns // grid_ns + 1) * grid_ns, batch.t_end_ns, grid_ns):
+        stop = int(np.searchsorted(batch.t_ns, cut_ns))
+        yield batch.slice(start, stop, cut_ns)
+        start = stop
+    yield batch.slice(start, len(batch), batch.t_end_ns)
+
+
+def _scores(
+    beacon: BeaconResult, options: Options, span_ns: tuple[int, int], signal: Signal | None
+) -> tuple[Transmission, ...]:
+    frame = CharacterFrame.from_parameters(options.parameters)
+    return score(beacon.characters, options.truth or '', span_ns, signal, frame)
+
+
+def _scored_beacons(
+    beacons: tuple[BeaconResult, ...], pieces: BagPieces, options: Options, span_ns: tuple[int, int]
+) -> tuple[BeaconResult, ...]:
+    """Score the beacons of a bag.
+
+    Where a score begins or ends with missing characters, the beacon may not have been there: the bag is read again
+    for the events around its path, which tell.
+    """
+    scored = [_scores(beacon, options, span_ns, None) for beacon in beacons]
+    doubtful = {
+        place: NearPath(beacon.path, options.parameters.routing_extent_factor, options.parameters.routing_margin_px)
+        for place, (beacon, transmissions) in enumerate(zip(beacons, scored, strict=True))
+        if beacon.path and any(transmission.open_ended for transmission in transmissions)
+    }
+    if doubtful:
+        problem = pieces.problem
+        for piece in pieces:
+            for near in doubtful.values():
+                near.push(piece.batch, piece.origin_ns)
+        pieces.problem = problem
+    for place, near in doubtful.items():
+        scored[place] = _scores(beacons[place], options, span_ns, near.signal())
+    frame = CharacterFrame.from_parameters(options.parameters)
+    for place, beacon in enumerate(beacons):
+        if not scored[place] and beacon.confirmed_at_ns is not None:
+            scored[place] = (not_found(options.truth or '', frame),)
+    return tuple(
+        replace(beacon, transmissions=transmissions) for beacon, transmissions in zip(beacons, scored, strict=True)
+    )

@@ -1,0 +1,167 @@
+"""Results as tables for a terminal, and the paper's figures beside ours."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import PurePath
+
+from beacon_comm.core.events import NS_PER_S
+from beacon_comm.evaluation.result import BeaconResult, RecordingResult
+from beacon_comm.evaluation.scoring import Interval, Transmission
+
+SCORE_COLUMNS = (
+    'recording', 'track', 'state', 'bit/s', 'confirmed', 'start', 'characters', 'wrong', 'missing', 'inserted',
+    'wrong ok', 'repaired', 'message accuracy', 'bit accuracy',
+)  # fmt: skip
+TEXT_COLUMNS = ('recording', 'track', 'state', 'bit/s', 'confirmed', 'bearing', 'characters', 'ok', 'text')
+RECORDING_COLUMNS = (
+    'recording', 'events', 'seconds', 'Mev/s', 'lost packets', 'skipped words', 'beacons', 'other tracks',
+)  # fmt: skip
+# Characters of a text that a table shows.
+SHOWN_TEXT = 48
+
+
+@dataclass(frozen=True, slots=True)
+class PublishedFigure:
+    """Message and bit accuracy of the paper's section IV, table "Outdoor Experiment"."""
+
+    message_accuracy: float
+    bit_accuracy: float
+
+
+# By the name that the published recording has.
+PUBLISHED = {
+    '504hz_30m': PublishedFigure(1.0, 1.0),
+    '504hz_100m': PublishedFigure(1.0, 1.0),
+    '3125hz_30m': PublishedFigure(0.877, 0.987),
+    '3125hz_100m': PublishedFigure(0.435, 0.906),
+}
+
+
+def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table with aligned columns; numbers and all but the first column stand right, texts left."""
+    cells = [tuple(columns), *(tuple(row) for row in rows)]
+    widths = [max(len(row[column]) for row in cells) for column in range(len(columns))]
+    left = {column for column, name in enumerate(columns) if name in ('recording', 'state', 'text')}
+    lines = [
+        '  '.join(
+            cell.ljust(width) if column in left else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in cells
+    ]
+    lines.insert(1, '  '.join('-' * width for width in widths))
+    return '\n'.join(lines)
+
+
+def recordings_table(results: Sequence[RecordingResult]) -> str:
+    """Return one row a recording: size, speed, losses, number of beacons."""
+    return table(
+        RECORDING_COLUMNS,
+        [
+            (
+                _name(result),
+                f'{result.events:,}',
+                f'{result.duration_ns / NS_PER_S:.3f}',
+                f'{result.mev_per_s:.2f}',
+                str(result.lost_packets),
+                str(result.skipped_words),
+                str(sum(beacon.confirmed_at_ns is not None for beacon in result.beacons)),
+                str(result.silent_tracks + sum(beacon.confirmed_at_ns is None for beacon in result.beacons)),
+            )
+            for result in results
+        ],
+    )
+
+
+def scores_table(results: Sequence[RecordingResult]) -> str:
+    """Return one row a transmission; accuracies with their 95 % confidence intervals."""
+    rows = []
+    for result in results:
+        for beacon in result.beacons:
+            rows += [_score_row(result, beacon, transmission) for transmission in beacon.transmissions]
+    return table(SCORE_COLUMNS, rows)
+
+
+def texts_table(results: Sequence[RecordingResult]) -> str:
+    """Return one row a beacon: state, bearing and the end of its text."""
+    rows = []
+    for result in results:
+        for beacon in result.beacons:
+            ok = sum(character.status.name == 'OK' for character in beacon.characters)
+            shown = repr(beacon.text[-SHOWN_TEXT:])[1:-1]
+            rows.append(
+                (*_beacon_cells(result, beacon), _bearing(beacon), str(len(beacon.characters)), str(ok), shown)
+            )
+    return table(TEXT_COLUMNS, rows)
+
+
+def published_table(results: Sequence[RecordingResult]) -> str | None:
+    """Return the paper's figures beside ours, None where no published recording is among the results.
+
+    The paper counts one sonnet a recording, the second one, whose start it detects: so the last transmission.
+    """
+    rows = []
+    for result in results:
+        paper = PUBLISHED.get(PurePath(result.recording).stem)
+        transmissions = [transmission for beacon in result.beacons for transmission in beacon.transmissions]
+        if paper is None or not transmissions:
+            continue
+        ours = transmissions[-1]
+        right = max(0, ours.characters - ours.wrong - ours.inserted) if ours.found else 0
+        rows.append(
+            (
+                PurePath(result.recording).stem,
+                f'{paper.message_accuracy:.3f}',
+                f'{ours.message_accuracy:.3f}',
+                f'{right} of {ours.characters}',
+                f'{paper.bit_accuracy:.3f}',
+                f'{ours.bit_accuracy:.4f}',
+            )
+        )
+    if not rows:
+        return None
+    return table(('recording', 'paper: message', 'ours: message', 'right', 'paper: bits', 'ours: bits'), rows)
+
+
+def _name(result: RecordingResult) -> str:
+    return PurePath(result.recording).name or result.recording
+
+
+def _beacon_cells(result: RecordingResult, beacon: BeaconResult) -> tuple[str, ...]:
+    return (
+        _name(result),
+        str(beacon.track_id),
+        beacon.state.name.lower(),
+        '-' if beacon.bit_rate_bps is None else f'{beacon.bit_rate_bps:g}',
+        '-' if beacon.confirmed_at_ns is None else f'{beacon.confirmed_at_ns / NS_PER_S:.3f} s',
+    )
+
+
+def _score_row(result: RecordingResult, beacon: BeaconResult, transmission: Transmission) -> tuple[str, ...]:
+    return (
+        *_beacon_cells(result, beacon),
+        'not found' if transmission.start_ns is None else f'{transmission.start_ns / NS_PER_S:.3f} s',
+        str(transmission.characters),
+        str(transmission.wrong),
+        str(transmission.missing),
+        str(transmission.inserted),
+        str(transmission.wrong_ok),
+        str(transmission.repaired),
+        _share(transmission.message_accuracy, transmission.message_interval if transmission.found else None, 3),
+        _share(transmission.bit_accuracy, transmission.bit_interval if transmission.found else None, 4),
+    )
+
+
+def _share(share: float, interval: Interval | None, digits: int) -> str:
+    if interval is None:
+        return f'{share:.{digits}f}'
+    return f'{share:.{digits}f} [{interval.low:.{digits}f}, {interval.high:.{digits}f}]'
+
+
+def _bearing(beacon: BeaconResult) -> str:
+    if beacon.azimuth_rad is None or beacon.elevation_rad is None:
+        return '-'
+    return f'{math.degrees(beacon.azimuth_rad):+.2f}° {math.degrees(beacon.elevation_rad):+.2f}°'

@@ -1,0 +1,93 @@
+"""Results of an evaluation: one value a beacon, one a recording.
+
+Times are *recording time*: ns since the recording's first event.  It goes on where a sensor was restarted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from beacon_comm.core.candidates import BeaconState
+from beacon_comm.core.character import Character
+from beacon_comm.evaluation.scoring import Transmission
+
+
+@dataclass(frozen=True, slots=True)
+class PathPoint:
+    """Where a track was.
+
+    Attributes:
+        t_ns: recording time (ns).
+        x_px, y_px: centre (px).
+        extent_px: radius of the blob (px).
+    """
+
+    t_ns: int
+    x_px: float
+    y_px: float
+    extent_px: float
+
+
+@dataclass(frozen=True, slots=True)
+class BeaconResult:
+    """What a recording gave of one track.
+
+    Attributes:
+        track_id: label.
+        state: its last state.
+        confirmed_at_ns: when it was first confirmed (recording time, ns), None: never.
+        bit_rate_bps: last settled bit rate (bit/s), None: none.
+        azimuth_rad, elevation_rad: last bearing, None without calibration.
+        path: its positions, every 20 ms of event time; empty for a recording without pixels.
+        characters: decoded characters in order of time, ``t_ns`` in recording time.
+        transmissions: scores against the truth, in order of time; empty without a truth.
+    """
+
+    track_id: int
+    state: BeaconState
+    confirmed_at_ns: int | None
+    bit_rate_bps: float | None
+    azimuth_rad: float | None
+    elevation_rad: float | None
+    path: tuple[PathPoint, ...]
+    characters: tuple[Character, ...]
+    transmissions: tuple[Transmission, ...] = ()
+
+    @property
+    def text(self) -> str:
+        """All decoded codes as text, whatever their status."""
+        return ''.join(chr(character.code) for character in self.characters)
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingResult:
+    """What a recording gave.
+
+    Attributes:
+        recording: its path, as given.
+        receiver: name of the demodulator.
+        events: events evaluated.
+        duration_ns: from the first to the end of what was evaluated (event time, ns).
+        processing_s: how long that took (s).
+        lost_packets: messages missing by their ``seq``.
+        skipped_words: words of unknown code.
+        beacons: tracks that were confirmed or gave characters, by label.
+        silent_tracks: tracks that did neither.
+        problem: what could not be read, None if all could.
+    """
+
+    recording: str
+    receiver: str
+    events: int
+    duration_ns: int
+    processing_s: float
+    lost_packets: int
+    skipped_words: int
+    beacons: tuple[BeaconResult, ...]
+    silent_tracks: int
+    problem: str | None = None
+
+    @property
+    def mev_per_s(self) -> float:
+        """Million events a second of processing time; 0 where nothing was processed."""
+        return self.events / self.processing_s / 1e6 if self.processing_s > 0 else 0.0
