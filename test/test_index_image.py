@@ -1,0 +1,107 @@
+"""The index images against a count from scratch, and their bounds."""
+
+import numpy as np
+import pytest
+from disc_events import HOP_NS, T0_NS, batch, hops, noise
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from beacon_comm.core.index_image import NO_EVENTS, HopEvents, IndexImages, whole_hops
+from beacon_comm.core.parameters import Parameters
+
+SIZE = (40, 30)
+
+
+def hop_events(segment):
+    """Pack a segment as the module's head draws it."""
+    x, y = segment.x.astype(np.uint32), segment.y.astype(np.uint32)
+    return HopEvents(y << 16 | x << 2 | (segment.polarity > 0), segment.t_ns)
+
+
+def expected_index(events, t_from, t_to, offset=10.0):
+    """Return n / (B + |Σσ|) of the events in [t_from, t_to), pixel by pixel."""
+    inside = (events.t_ns >= t_from) & (events.t_ns < t_to)
+    n, balance = np.zeros(SIZE[::-1]), np.zeros(SIZE[::-1])
+    np.add.at(n, (events.y[inside], events.x[inside]), 1)
+    np.add.at(balance, (events.y[inside], events.x[inside]), events.polarity[inside])
+    return n / (offset + np.abs(balance))
+
+
+def test_sliding_windows_equal_counting_from_scratch():
+    parameters = Parameters(bit_rates=(200.0, 3125.0))
+    images = IndexImages(parameters, SIZE)
+    assert [window.hops for window in images.windows] == [2, 11]
+    events = noise(*SIZE, rate_per_s=200_000, duration_s=0.3)
+    for segment in hops(events):
+        images.push(hop_events(segment))
+        for window in images.windows:
+            start = segment.t_end_ns - window.hops * HOP_NS
+            np.testing.assert_array_equal(
+                images.index(window), expected_index(events, start, segment.t_end_ns)
+            )
+            counted = window.counts.reshape(SIZE[1], SIZE[0], 2).sum(axis=2)
+            assert window.events == counted.sum()
+            tiles = window.tiles.reshape(images.tiles_down, images.tiles_across)
+            assert tiles[0, 2] == counted[:16, 32:].sum() and tiles[1, 0] == counted[16:, :16].sum()
+
+
+def test_windows_run_empty():
+    images = IndexImages(Parameters(), SIZE)
+    images.push(hop_events(noise(*SIZE, 10_000, 0.009)))
+    assert not images.empty
+    for _ in range(images.windows[-1].hops):
+        images.push(NO_EVENTS)
+    assert images.empty
+    assert not any(window.counts.any() or window.tiles.any() for window in images.windows)
+
+
+def test_a_long_window_no_longer_than_the_short_one_is_not_kept():
+    assert len(IndexImages(Parameters(bit_rates=(3125.0,)), SIZE).windows) == 1
+    assert [w.hops for w in IndexImages(Parameters(bit_rates=(20.0,)), SIZE).windows] == [2, 110]
+
+
+@pytest.mark.parametrize(('window_s', 'expected'), [(0.02, 2), (0.0201, 3), (0.001, 1), (1.1, 110)])
+def test_windows_are_whole_hops(window_s, expected):
+    assert whole_hops(window_s, 0.01) == expected
+
+
+def test_noise_pixel_scores_low_and_a_balanced_one_high():
+    images = IndexImages(Parameters(), SIZE)
+    polarity = [1, -1] + [1, -1] * 20 + [1] * 40
+    x = [0, 0] + [1] * 40 + [2] * 40
+    images.push(hop_events(batch(x, [5] * 82, polarity, T0_NS + np.arange(82))))
+    index = images.index(images.windows[0])
+    assert index[5, :4].tolist() == [0.2, 4.0, 0.8, 0.0]
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.integers(0, 400), min_size=1, max_size=30), st.integers(1000, 5000))
+def test_the_ring_is_bounded_and_overflow_counted(sizes, max_bytes):
+    images = IndexImages(Parameters(bit_rates=(100.0,), window_max_bytes=max_bytes), SIZE)
+    pushed = 0
+    for k, size in enumerate(sizes):
+        images.push(hop_events(noise(*SIZE, 1.0, 1.0, seed=k)) if size == 0 else _many(size, k))
+        pushed += len(images.newest)
+        kept = images.hop_events(images.windows[-1])
+        assert sum(len(events) for events in kept) == images.windows[-1].events
+        assert sum(events.size_bytes for events in kept[:-1]) + images.newest.size_bytes <= max(
+            max_bytes, images.newest.size_bytes
+        )
+        for window in images.windows:
+            assert window.counts.sum() == window.events == window.tiles.sum()
+            assert window.counts.min() >= 0
+    if sum(sizes) * 12 <= max_bytes:
+        assert images.overflow_events == 0
+    assert images.windows[-1].events + images.overflow_events <= pushed
+
+
+def _many(size, seed):
+    rng = np.random.default_rng(seed)
+    x, y = rng.integers(0, SIZE[0], size), rng.integers(0, SIZE[1], size)
+    return hop_events(batch(x, y, rng.choice([-1, 1], size), T0_NS + np.arange(size)))
+
+
+@pytest.mark.parametrize('size', [(0, 10), (10, 0), (20_000, 10)])
+def test_an_impossible_sensor_is_refused(size):
+    with pytest.raises(ValueError, match='sensor_size'):
+        IndexImages(Parameters(), size)
