@@ -27,8 +27,9 @@ def expected_index(events, t_from, t_to, offset=10.0):
     return n / (offset + np.abs(balance))
 
 
-def test_sliding_windows_equal_counting_from_scratch():
-    parameters = Parameters(bit_rates=(200.0, 3125.0))
+@pytest.mark.parametrize(('threshold', 'offset'), [(0.6, 10.0), (2.0, 1.0)])  # above 1 a subtraction can list a pixel
+def test_sliding_windows_equal_counting_from_scratch(threshold, offset):
+    parameters = Parameters(bit_rates=(200.0, 3125.0), index_threshold=threshold, index_offset=offset)
     images = IndexImages(parameters, SIZE)
     assert [window.hops for window in images.windows] == [2, 11]
     events = noise(*SIZE, rate_per_s=200_000, duration_s=0.3)
@@ -37,12 +38,12 @@ def test_sliding_windows_equal_counting_from_scratch():
         for window in images.windows:
             start = segment.t_end_ns - window.hops * HOP_NS
             np.testing.assert_array_equal(
-                images.index(window), expected_index(events, start, segment.t_end_ns)
+                images.index(window), expected_index(events, start, segment.t_end_ns, offset)
             )
             counted = window.counts.reshape(SIZE[1], SIZE[0], 2).sum(axis=2)
             assert window.events == counted.sum()
-            tiles = window.tiles.reshape(images.tiles_down, images.tiles_across)
-            assert tiles[0, 2] == counted[:16, 32:].sum() and tiles[1, 0] == counted[16:, :16].sum()
+            low = images.low_pixels(window)
+            assert sorted(low) == np.flatnonzero(images.index(window) >= parameters.index_threshold / 2).tolist()
 
 
 def test_windows_run_empty():
@@ -52,7 +53,8 @@ def test_windows_run_empty():
     for _ in range(images.windows[-1].hops):
         images.push(NO_EVENTS)
     assert images.empty
-    assert not any(window.counts.any() or window.tiles.any() for window in images.windows)
+    assert not any(window.counts.any() or len(images.low_pixels(window)) for window in images.windows)
+    assert not any(window.mark.any() for window in images.windows)
 
 
 def test_a_long_window_no_longer_than_the_short_one_is_not_kept():
@@ -88,7 +90,7 @@ def test_the_ring_is_bounded_and_overflow_counted(sizes, max_bytes):
             max_bytes, images.newest.size_bytes
         )
         for window in images.windows:
-            assert window.counts.sum() == window.events == window.tiles.sum()
+            assert window.counts.sum() == window.events
             assert window.counts.min() >= 0
     if sum(sizes) * 12 <= max_bytes:
         assert images.overflow_events == 0

@@ -111,6 +111,8 @@ def test_the_buffer_is_the_end_of_the_stream(pieces, max_bytes):
         overflow += buffer.trim(t_hop)
         stream = stream[stream >= t_hop - 3 * HOP_NS]
         stream = stream[max(0, len(stream) - max_bytes // EVENT_BYTES) :]
+        if k % 3:  # what has been looked at, or not, makes no difference later
+            continue
         kept, polarity = buffer.events()
         np.testing.assert_array_equal(kept, stream)
         np.testing.assert_array_equal(polarity, np.where(stream % 2, 1, -1))

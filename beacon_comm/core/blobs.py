@@ -108,7 +108,7 @@ class BlobFinder:
         self._sets = []
         if images.empty:
             return []
-        self._sets = [f.find(window) for f, window in zip(self._finders, images.windows, strict=False)]
+        self._sets = [f.find(images, window) for f, window in zip(self._finders, images.windows, strict=False)]
         standing = self._choose(images.windows)
         window = np.repeat(np.arange(len(standing)), [len(numbers) for numbers in standing])
         if len(window) == 0:

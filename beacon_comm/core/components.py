@@ -1,7 +1,6 @@
 """Connected components of high-index pixels: compiled, and only where there are events.
 
-    counts -> low: I >= share * threshold -> closed: low • square -> components, 8-connected
-              seeds: I >= threshold          (holes filled)          (without a seed: none)
+    low: I >= share * threshold ─► closed: low • square ─► components, 8-connected ─► with a seed: I >= threshold
 
 A pixel set is a list of pixel numbers (y width + x) and an image of marks; only listed pixels are ever visited
 and cleared again, so that an image that is dark but for a few blobs costs next to nothing.
@@ -18,7 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from beacon_comm.core.index_image import TILE_SHIFT, Window, tiles_along
+from beacon_comm.core.index_image import IndexImages, Window
 from beacon_comm.core.parameters import Parameters
 
 # Columns of ComponentSet.sums.
@@ -59,7 +58,7 @@ class ComponentFinder:
     """Finds the components of one window; keeps the images it works in.
 
     Args:
-        parameters: ``index_threshold``, ``index_grow_share``, ``index_offset``, ``closing_px``.
+        parameters: ``index_threshold``, ``index_offset``, ``closing_px``.
         sensor_size: width and height (px).
     """
 
@@ -67,7 +66,6 @@ class ComponentFinder:
         self._width, self._height = sensor_size
         size = self._width * self._height
         self._threshold = parameters.index_threshold
-        self._low = parameters.index_threshold * parameters.index_grow_share
         self._offset = parameters.index_offset
         self._closing_px = parameters.closing_px
         self._mark = np.zeros(size, np.uint8)
@@ -76,48 +74,26 @@ class ComponentFinder:
         self._list = np.empty(size, np.int32)
         self._labelled = 0
 
-    def find(self, window: Window) -> ComponentSet:
-        """Return the components of ``window``, in order of their first tile.
+    def find(self, images: IndexImages, window: Window) -> ComponentSet:
+        """Return the components of ``window``, in the order in which their pixels were listed.
 
         The arrays of the result are valid until the next call.
         """
         self._label[self._pixel[: self._labelled]] = 0
-        self._labelled = 0
-        low, width, height = self._low, self._width, self._height
-        found = _above(window.counts, window.tiles, width, height, low, self._offset, self._mark, self._list)
+        low = images.low_pixels(window)
+        width, height, found = self._width, self._height, len(low)
+        self._list[:found] = low
+        self._mark[low] = _SEEN
         if self._closing_px > 1:
             found = _close(self._mark, self._list, self._pixel, found, width, height, self._closing_px)
         else:
-            self._mark[self._list[:found]] = _CLOSED
+            self._mark[low] = _CLOSED
         first, sums, index = _label_components(
             window.counts, width, height, self._threshold, self._offset, self._mark, self._list, found,
             self._label, self._pixel,
         )  # fmt: skip
         self._labelled = found
         return ComponentSet(self._label, self._pixel, first, sums, index)
-
-
-@njit(cache=True, nogil=True)
-def _above(counts, tiles, width, height, low, offset, mark, listed):  # type: ignore[no-untyped-def]
-    """List and mark the pixels with n >= low (offset + |Σσ|); tiles with too few events are skipped."""
-    across = tiles_along_compiled(width)
-    fewest = max(1, np.int64(np.ceil(low * offset)))
-    found = 0
-    for tile in range(len(tiles)):
-        if tiles[tile] < fewest:
-            continue
-        top, left = (tile // across) << TILE_SHIFT, (tile % across) << TILE_SHIFT
-        for y in range(top, min(top + (1 << TILE_SHIFT), height)):
-            for p in range(y * width + left, y * width + min(left + (1 << TILE_SHIFT), width)):
-                n = counts[2 * p] + counts[2 * p + 1]
-                if n >= fewest and n >= low * (offset + abs(counts[2 * p + 1] - counts[2 * p])):
-                    mark[p] = _SEEN
-                    listed[found] = p
-                    found += 1
-    return found
-
-
-tiles_along_compiled = njit(cache=True, nogil=True)(tiles_along)
 
 
 @njit(cache=True, nogil=True)

@@ -3,7 +3,7 @@
     t_ns      [ free | live events ……………………… | room ]
     polarity  [ free | live events ……………………… | room ]       one array each, moved down or doubled when full
 
-Old events are dropped at hops alone and by event time, so that any batching leaves the same events.
+What is too old or too much is decided at hops alone and by event time, so that any batching leaves the same events.
 """
 
 from __future__ import annotations
@@ -36,9 +36,11 @@ class EventBuffer:
         self._polarity = np.empty(_FIRST_ROOM, np.int8)
         self._start = 0
         self._stop = 0
+        self._oldest_ns = np.iinfo(np.int64).min
         self.overflow_events = 0
 
     def __len__(self) -> int:
+        """Return how many events are held; some may be too old already."""
         return self._stop - self._start
 
     def append(self, t_ns: NDArray[np.int64], polarity: NDArray[np.int8]) -> None:
@@ -51,12 +53,11 @@ class EventBuffer:
         self._stop += n
 
     def trim(self, t_hop_ns: int) -> int:
-        """Drop what is too old at ``t_hop_ns`` (ns) or too much; return how many events were too much."""
-        if self._stop == self._start:
-            return 0
-        oldest = t_hop_ns - self._length_ns
-        if self._t_ns[self._start] < oldest:
-            self._start += int(np.searchsorted(self._t_ns[self._start : self._stop], oldest))
+        """Let go what is too old at ``t_hop_ns`` (ns) or too much; return how many events were too much."""
+        self._oldest_ns = t_hop_ns - self._length_ns
+        if len(self) <= self._max_events:
+            return 0  # what is too old goes when it is in the way
+        self._drop_old()
         excess = max(0, len(self) - self._max_events)
         self._start += excess
         self.overflow_events += excess
@@ -64,10 +65,16 @@ class EventBuffer:
 
     def events(self) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
         """Return copies of the times (ns), ``(n,)`` int64, and polarities, ``(n,)`` int8 of ±1."""
+        self._drop_old()
         live = slice(self._start, self._stop)
         return self._t_ns[live].copy(), self._polarity[live].copy()
 
+    def _drop_old(self) -> None:
+        if self._start < self._stop and self._t_ns[self._start] < self._oldest_ns:
+            self._start += int(np.searchsorted(self._t_ns[self._start : self._stop], self._oldest_ns))
+
     def _make_room(self, n: int) -> None:
+        self._drop_old()
         live = slice(self._start, self._stop)
         t_ns, polarity, kept = self._t_ns, self._polarity, len(self)
         if 2 * (kept + n) > len(t_ns):

@@ -16,7 +16,8 @@ A window is kept as one count image, ON and OFF events apart, flat, pixel after 
     counts  int32   [on off | on off | on off | …]   index 2 (y width + x) + on      n = on + off, Σσ = on - off
 
 A hop adds its events and subtracts those of the hop that leaves: its cost is that of the events that come and go.
-The counts of 16 x 16 pixel tiles tell later stages which parts of the image they may skip.  An event in the ring is
+A pixel's index changes with its events alone, so these also tell which pixels have come above the lower threshold
+(index_grow_share × index_threshold): they are listed, and no image is ever searched.  An event in the ring is
 
     word    uint32  [ y: 16 bits | x: 14 bits | routed | on ]      and its time, int64 ns
 """
@@ -35,7 +36,6 @@ from numpy.typing import NDArray
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.parameters import Parameters
 
-TILE_SHIFT = 4  # tiles of 16 x 16 pixels
 MAX_WIDTH = 1 << 14
 MAX_HEIGHT = 1 << 16
 
@@ -70,13 +70,18 @@ class Window:
     Attributes:
         hops: its length.
         counts: ON and OFF events of every pixel, ``(2 height width,)`` int32; see the module's head.
-        tiles: events of every 16 x 16 pixel tile, row by row, ``(tiles_down tiles_across,)`` int32.
+        mark: whether a pixel is listed, ``(height width,)`` uint8.
+        pixel: numbers y width + x of the listed pixels, ``(height width,)`` int32, the first ``listed`` are valid;
+            every pixel above the lower threshold is among them.
+        listed: how many.
         events: events in the window.
     """
 
     hops: int
     counts: NDArray[np.int32]
-    tiles: NDArray[np.int32]
+    mark: NDArray[np.uint8]
+    pixel: NDArray[np.int32]
+    listed: int = 0
     events: int = 0
 
 
@@ -84,7 +89,8 @@ class IndexImages:
     """The detection windows of one sensor.
 
     Args:
-        parameters: ``hop_s``, ``short_window_s``, ``long_window_bits``, ``bit_rates``, ``window_max_bytes``.
+        parameters: ``hop_s``, ``short_window_s``, ``long_window_bits``, ``bit_rates``, ``window_max_bytes``,
+            ``index_offset``, ``index_threshold``, ``index_grow_share``.
         sensor_size: width and height (px).
 
     Attributes:
@@ -96,10 +102,9 @@ class IndexImages:
         self.width, self.height = sensor_size
         if not (0 < self.width <= MAX_WIDTH and 0 < self.height <= MAX_HEIGHT):
             raise ValueError(f'sensor_size = {sensor_size}: must lie in [1, {MAX_WIDTH}] x [1, {MAX_HEIGHT}] px')
-        self.tiles_across = tiles_along(self.width)
-        self.tiles_down = tiles_along(self.height)
         self._max_bytes = parameters.window_max_bytes
         self._offset = parameters.index_offset
+        self._low = parameters.index_threshold * parameters.index_grow_share
         short = whole_hops(parameters.short_window_s, parameters.hop_s)
         long = whole_hops(parameters.long_window_bits * parameters.slowest_bit_s, parameters.hop_s)
         self.windows = [self._empty_window(hops) for hops in ((short, long) if long > short else (short,))]
@@ -108,8 +113,8 @@ class IndexImages:
         self.overflow_events = 0
 
     def _empty_window(self, hops: int) -> Window:
-        counts = np.zeros(2 * self.width * self.height, np.int32)
-        return Window(hops, counts, np.zeros(self.tiles_across * self.tiles_down, np.int32))
+        size = self.width * self.height
+        return Window(hops, np.zeros(2 * size, np.int32), np.zeros(size, np.uint8), np.empty(size, np.int32))
 
     @property
     def empty(self) -> bool:
@@ -150,8 +155,18 @@ class IndexImages:
 
     def _count(self, window: Window, events: HopEvents, sign: int) -> None:
         if len(events):
-            count_events(events.word, sign, self.width, self.tiles_across, window.counts, window.tiles)
+            window.listed = _count(
+                events.word, sign, self.width, self._low, self._offset,
+                window.counts, window.mark, window.pixel, window.listed,
+            )  # fmt: skip
             window.events += sign * len(events)
+
+    def low_pixels(self, window: Window) -> NDArray[np.int32]:
+        """Return the numbers y width + x of the pixels above the lower threshold, each once, ``(n,)`` int32."""
+        window.listed = _still_above(
+            window.counts, self._low, self._offset, window.mark, window.pixel, window.listed
+        )
+        return window.pixel[: window.listed]
 
     def index(self, window: Window) -> NDArray[np.float64]:
         """Return the index image of ``window``, ``(height, width)`` float64 (paper, section III)."""
@@ -171,16 +186,35 @@ def hop_length_ns(parameters: Parameters) -> int:
     return round(parameters.hop_s * NS_PER_S)
 
 
-def tiles_along(length_px: int) -> int:
-    """Return how many tiles a side of the sensor needs."""
-    return ((length_px - 1) >> TILE_SHIFT) + 1
+@njit(cache=True, nogil=True)
+def _count(word, sign, width, low, offset, counts, mark, pixel, listed):  # type: ignore[no-untyped-def]
+    """Add ``sign`` to each event's count, list the pixels that are above the lower threshold then.
+
+    A subtraction can bring a pixel above it, too: when it takes from the polarity there is more of.
+    """
+    fewest = max(1.0, np.ceil(low * offset))
+    for i in range(len(word)):
+        x = np.int64((word[i] >> 2) & 0x3FFF)
+        p = np.int64(word[i] >> 16) * width + x
+        counts[2 * p + np.int64(word[i] & 1)] += sign
+        n = counts[2 * p] + counts[2 * p + 1]
+        if n >= fewest and not mark[p] and n >= low * (offset + abs(counts[2 * p + 1] - counts[2 * p])):
+            mark[p] = 1
+            pixel[listed] = p
+            listed += 1
+    return listed
 
 
 @njit(cache=True, nogil=True)
-def count_events(word, sign, width, tiles_across, counts, tiles):  # type: ignore[no-untyped-def]
-    """Add ``sign`` to the count of every event's pixel and polarity and of its tile."""
-    for i in range(len(word)):
-        x = np.int64((word[i] >> 2) & 0x3FFF)
-        y = np.int64(word[i] >> 16)
-        counts[2 * (y * width + x) + np.int64(word[i] & 1)] += sign
-        tiles[(y >> TILE_SHIFT) * tiles_across + (x >> TILE_SHIFT)] += sign
+def _still_above(counts, low, offset, mark, pixel, listed):  # type: ignore[no-untyped-def]
+    """Strike the pixels off the list that are no longer above the lower threshold; return how many stay."""
+    stay = 0
+    for i in range(listed):
+        p = pixel[i]
+        n = counts[2 * p] + counts[2 * p + 1]
+        if n > 0 and n >= low * (offset + abs(counts[2 * p + 1] - counts[2 * p])):
+            pixel[stay] = p
+            stay += 1
+        else:
+            mark[p] = 0
+    return stay

@@ -23,7 +23,7 @@ from beacon_comm.core.events import EventBatch
 from beacon_comm.core.index_image import HopEvents, hop_length_ns
 from beacon_comm.core.nearest import CELL_SHIFT, cell_lists, cells_along
 from beacon_comm.core.parameters import Parameters
-from beacon_comm.core.tracks import Track
+from beacon_comm.core.tracks import Track, positions_at
 
 _FIRST_ROOM = 4096
 
@@ -73,14 +73,11 @@ class Router:
         """Route by ``tracks`` in the hop interval that begins at ``t_hop_ns`` (ns)."""
         self._track_ids = [track.track_id for track in tracks]
         self._t_hop_ns = t_hop_ns
-        circle = np.zeros((len(tracks), 5))
-        box = np.zeros((len(tracks), 4))
-        for k, track in enumerate(tracks):
-            x0, y0 = track.position_at(t_hop_ns)
-            x1, y1 = track.position_at(t_hop_ns + self._hop_ns)
-            radius = track.extent_px * self._factor + self._margin
-            circle[k] = x0, y0, (x1 - x0) / self._hop_ns, (y1 - y0) / self._hop_ns, radius
-            box[k] = min(x0, x1) - radius, max(x0, x1) + radius, min(y0, y1) - radius, max(y0, y1) + radius
+        now, then = positions_at(tracks, t_hop_ns), positions_at(tracks, t_hop_ns + self._hop_ns)
+        radius = np.array([track.extent_px for track in tracks]) * self._factor + self._margin
+        circle = np.column_stack((now, (then - now) / self._hop_ns, radius))
+        low, high = np.minimum(now, then) - radius[:, None], np.maximum(now, then) + radius[:, None]
+        box = np.column_stack((low[:, 0], high[:, 0], low[:, 1], high[:, 1]))
         self._circle = circle
         self._first, self._member = cell_lists(box, self._width, self._height)
 

@@ -144,7 +144,7 @@ class Tracker:
         if not blobs and not self._tracks:
             return TrackChanges()
         tracks = list(self._tracks.values())
-        centre = np.array([track.position_at(t_hop_ns) for track in tracks]).reshape(-1, 2)
+        centre = positions_at(tracks, t_hop_ns)
         blob_of, track_of = self._associate(tracks, centre, blobs, t_hop_ns)
         covering = _covering(centre, blobs, blob_of, track_of)
         for i, track in enumerate(tracks):
@@ -204,7 +204,7 @@ class Tracker:
         left = [j for j in range(len(blobs)) if track_of[j] < 0]
         seen = [tracks[i] for i in range(len(tracks)) if blob_of[i] >= 0]
         if left and seen:
-            circle = np.array([(*track.position_at(t_hop_ns), track.extent_px) for track in seen])
+            circle = np.column_stack((positions_at(seen, t_hop_ns), [track.extent_px for track in seen]))
             piece_of = _circle_of(np.array([(blobs[j].x_px, blobs[j].y_px) for j in left]), circle)
             left = [j for j, i in zip(left, piece_of, strict=True) if i < 0]
         left.sort(key=lambda j: (-blobs[j].index, -blobs[j].event_count, j))
@@ -221,6 +221,18 @@ class Tracker:
         self._tracks[track.track_id] = track
         self._next_id += 1
         return track
+
+
+def positions_at(tracks: Sequence[Track], t_ns: int) -> NDArray[np.float64]:
+    """Return the predicted centres (px) of tracks at ``t_ns`` (ns), ``(n, 2)`` float64."""
+    if not tracks:
+        return np.empty((0, 2))
+    state = np.array([(t.x_px, t.y_px, t.vx_px_per_s, t.vy_px_per_s, t_ns - t.t_ns) for t in tracks])
+    dt_s = state[:, 4] / NS_PER_S
+    faded = _STEADY_S - _FADE_S * np.expm1((_STEADY_S - np.maximum(dt_s, _STEADY_S)) / _FADE_S)
+    s = np.where(dt_s <= _STEADY_S, dt_s, faded)
+    positions: NDArray[np.float64] = state[:, :2] + state[:, 2:4] * s[:, None]
+    return positions
 
 
 def _take(track: Track, blob: Blob, t_hop_ns: int) -> None:
