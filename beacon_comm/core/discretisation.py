@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from beacon_comm.core.character import Character
 from beacon_comm.core.events import NS_PER_S
@@ -27,49 +26,48 @@ _FIRST_CAPACITY = 256
 
 
 class EdgeRecord:
-    """The edges since the start of the character that is being received, in arrays that grow when they must."""
+    """The edges since the start of the character that is being received, in arrays that grow when they must.
+
+    Attributes:
+        t_ns: times (ns), ``(capacity,)`` int64, of which the first ``count`` hold.
+        rising: directions, ``(capacity,)`` bool (True: rising).
+        count: number of edges.
+        level_before: level of the line before the first edge (True: high).
+    """
 
     def __init__(self) -> None:
-        self._t_ns = np.empty(_FIRST_CAPACITY, np.int64)
-        self._rising = np.empty(_FIRST_CAPACITY, np.bool_)
-        self._start = 0
-        self._stop = 0
-        self._level_before = True  # the line starts high
+        self.t_ns = np.empty(_FIRST_CAPACITY, np.int64)
+        self.rising = np.empty(_FIRST_CAPACITY, np.bool_)
+        self.count = 0
+        self.level_before = True  # the line starts high
+
+    def lacks_room(self, edges: Edges) -> bool:
+        """Whether the arrays would have to grow to take these edges."""
+        return self.count + len(edges.t_ns) > len(self.t_ns)
 
     def append(self, edges: Edges) -> None:
         """Take the next edges."""
-        count = len(edges.t_ns)
-        if self._stop + count > len(self._t_ns):
-            self._make_room(count)
-        self._t_ns[self._stop : self._stop + count] = edges.t_ns
-        self._rising[self._stop : self._stop + count] = edges.rising
-        self._stop += count
+        if self.lacks_room(edges):
+            self._move(0, 2 * (self.count + len(edges.t_ns)))  # twice: copies stay rare
+        count = self.count + len(edges.t_ns)
+        self.t_ns[self.count : count] = edges.t_ns
+        self.rising[self.count : count] = edges.rising
+        self.count = count
 
     def forget(self, t_ns: int) -> None:
-        """Drop the edges before ``t_ns`` (ns); the level there stays known."""
-        dropped = int(np.searchsorted(self._t_ns[self._start : self._stop], t_ns, side='left'))
-        if dropped:
-            self._start += dropped
-            self._level_before = bool(self._rising[self._start - 1])
+        """Drop the edges before ``t_ns`` (ns)."""
+        first = int(np.searchsorted(self.t_ns[: self.count], t_ns, side='left'))
+        if first:
+            self.level_before = bool(self.rising[first - 1])
+            self._move(first, max(_FIRST_CAPACITY, 2 * (self.count - first)))
 
-    def since(self, t_ns: int) -> tuple[NDArray[np.int64], NDArray[np.bool_], bool]:
-        """Return the edges from ``t_ns`` (ns) on, and the level before them.
-
-        Returns:
-            Times (ns) ``(n,)`` int64, directions ``(n,)`` bool (True: rising), level (True: high).
-        """
-        first = self._start + int(np.searchsorted(self._t_ns[self._start : self._stop], t_ns, side='left'))
-        level_before = self._level_before if first == self._start else bool(self._rising[first - 1])
-        return self._t_ns[first : self._stop], self._rising[first : self._stop], level_before
-
-    def _make_room(self, count: int) -> None:
-        held = slice(self._start, self._stop)
-        capacity = max(len(self._t_ns), 2 * (self._stop - self._start + count))
+    def _move(self, first: int, capacity: int) -> None:
+        kept = slice(first, self.count)
         t_ns, rising = np.empty(capacity, np.int64), np.empty(capacity, np.bool_)
-        self._stop -= self._start
-        t_ns[: self._stop] = self._t_ns[held]
-        rising[: self._stop] = self._rising[held]
-        self._t_ns, self._rising, self._start = t_ns, rising, 0
+        self.count -= first
+        t_ns[: self.count] = self.t_ns[kept]
+        rising[: self.count] = self.rising[kept]
+        self.t_ns, self.rising = t_ns, rising
 
 
 class CharacterReader:
@@ -83,33 +81,35 @@ class CharacterReader:
     def __init__(self, bit_rate_bps: float, frame: CharacterFrame) -> None:
         self._bit_rate_bps = bit_rate_bps
         self._bit_ns = NS_PER_S / bit_rate_bps
-        self._frame = frame
+        self._length = frame.length
+        self._decode = frame.decoding_table()
 
     def read(self, span: Span, record: EdgeRecord) -> Character:
         """Return the character of ``span``; ``record`` must hold the edges from its start on."""
-        length = self._frame.length
-        slot_ns = (span.stop_ns - span.start_ns) / length if span.stop_seen else self._bit_ns
-        t_ns, rising, level_before = record.since(span.start_ns)
-        bits, confidence = _read_slots(t_ns, rising, level_before, span.start_ns, slot_ns, length)
-        code, status = self._frame.decode_frame(bits)
+        slot_ns = (span.stop_ns - span.start_ns) / self._length if span.stop_seen else self._bit_ns
+        bits, confidence = _read_slots(
+            record.t_ns, record.rising, record.count, record.level_before, span.start_ns, slot_ns, self._length
+        )
+        code, status = self._decode[bits]
         return Character(span.start_ns, code, status, confidence, bits, self._bit_rate_bps)
 
 
 @njit(cache=True, nogil=True)
-def _read_slots(edge_t, edge_rising, level_before, start, slot, length):  # type: ignore[no-untyped-def]
+def _read_slots(edge_t, edge_rising, count, level_before, start, slot, length):  # type: ignore[no-untyped-def]
     """Return the levels in the middles of the slots, first one most significant, and the confidence."""
     bits = 0
     nearest = 0.5 * slot
-    level = 1 if level_before else 0
-    i = 0
+    i = np.searchsorted(edge_t[:count], start)
+    level = level_before if i == 0 else edge_rising[i - 1]
+    first = i
     for k in range(length):
         middle = (k + 0.5) * slot
-        while i < len(edge_t) and edge_t[i] - start <= middle:
-            level = 1 if edge_rising[i] else 0
+        while i < count and edge_t[i] - start <= middle:
+            level = edge_rising[i]
             i += 1
-        if i > 0:
+        if i > first:
             nearest = min(nearest, middle - (edge_t[i - 1] - start))
-        if i < len(edge_t):
+        if i < count:
             nearest = min(nearest, (edge_t[i] - start) - middle)
-        bits = bits << 1 | level
+        bits = bits << 1 | (1 if level else 0)
     return bits, nearest / (0.5 * slot)

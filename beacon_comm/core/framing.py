@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,6 +111,10 @@ class CharacterFrame:
             return code, Status.FRAMING_ERROR
         return code, Status.OK
 
+    def decoding_table(self) -> tuple[tuple[int, Status], ...]:
+        """Return what :meth:`decode_frame` returns, for every possible frame; computed once for equal layouts."""
+        return _decoding_table(self)
+
     def encode_bits(self, text: str | bytes) -> NDArray[np.uint8]:
         """Return the bits of a text in the order they are sent, ``(len(text) * length,)`` uint8.
 
@@ -141,6 +146,11 @@ class CharacterFrame:
             name = f'{symbol!r} (U+{code:04X})' if isinstance(symbol, str) else f'byte 0x{code:02X}'
             raise FramingError(f'{name} at position {position} does not fit into {self.data_bits} data bits')
         return code
+
+
+@lru_cache(maxsize=16)
+def _decoding_table(frame: CharacterFrame) -> tuple[tuple[int, Status], ...]:
+    return tuple(frame.decode_frame(bits) for bits in range(1 << frame.length))
 
 
 def transitions(

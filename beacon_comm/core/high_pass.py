@@ -94,7 +94,7 @@ class HighPassFilter:
             edge_t,
             edge_rising,
         )
-        return Edges(edge_t[:count].copy(), edge_rising[:count].copy())
+        return Edges(edge_t[:count], edge_rising[:count])
 
 
 @njit(cache=True, nogil=True)

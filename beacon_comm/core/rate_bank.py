@@ -11,7 +11,7 @@ A rate is settled when 8 of its last 10 characters are ok and over their span no
 it explains, less twice the time of its characters that are not ok.  Where its ok characters cover three quarters of
 that span there is no room for another rate, and it is settled at once.  Otherwise (a beacon with pauses between its
 characters, or a slow signal read too fast) it waits until every slower rate has had as many characters, or the time
-for 15.
+for 15.  Of two rates so close that both read the signal, the one whose clock agrees better is kept.
 
 If nothing is settled after 15 characters of the slowest rate, those of the rate that explains most are given out all
 the same, so that the parity record can judge them, and the trial goes on.
@@ -49,6 +49,9 @@ FULL_SHARE = 0.75
 
 CONTRADICTION_WEIGHT = 2
 """Time covered by characters that are not ok counts so many times against a rate."""
+
+ALIKE = 0.05
+"""Rates that differ by less than half a bit in a character can both read a signal; the better clock is kept."""
 
 HELD_CHARACTERS = 15
 """Nothing is held for longer than so many characters of the slowest rate."""
@@ -91,8 +94,14 @@ class _Rate:
         """Start and end of the readings it is judged by (ns)."""
         return self.last[0].span.start_ns, self.last[-1].span.stop_ns
 
-    def merit(self, start_ns: int, stop_ns: int) -> tuple[int, float]:
-        """Return what speaks for the rate between two times (ns); for rates alike in that, how well the clock agrees.
+    @property
+    def clock_error(self) -> float:
+        """How far the typical character is off its nominal duration, as a share of it; 1 without characters."""
+        spans_ns = [reading.span.stop_ns - reading.span.start_ns for reading in self.last]
+        return abs(statistics.median(spans_ns) / self.duration_ns - 1.0) if spans_ns else 1.0
+
+    def merit_ns(self, start_ns: int, stop_ns: int) -> int:
+        """Return how much more time between two times (ns) speaks for the rate than against it.
 
         A character that is not ok speaks against it twice as much as an ok one for it: a slow rate reads a few frames
         out of a fast signal with pauses by chance, and each of them is long.
@@ -100,12 +109,10 @@ class _Rate:
         first = len(self.held)
         while first and self.held[first - 1].span.stop_ns > start_ns:
             first -= 1
-        spans_ns = [reading.span.stop_ns - reading.span.start_ns for reading in self.last]
-        clock_error = abs(statistics.median(spans_ns) / self.duration_ns - 1.0) if spans_ns else 1.0
         overlapping = self.held[first:]
         explained = explained_ns(overlapping, start_ns, stop_ns)
         contradicting = covered_ns(overlapping, start_ns, stop_ns) - explained
-        return explained - CONTRADICTION_WEIGHT * contradicting, -clock_error
+        return explained - CONTRADICTION_WEIGHT * contradicting
 
     def merit_since(self, start_ns: int) -> tuple[int, int]:
         """Return the time explained from ``start_ns`` on (ns); for rates alike in that, the number of characters."""
@@ -173,8 +180,20 @@ class RateBank:
         return self._held_since_ns is not None and now_ns > self._held_since_ns + self._longest_ns
 
     def _is_best(self, rate: _Rate) -> bool:
+        """Tell whether no other rate has more for it over the span that ``rate`` is judged by."""
         start_ns, stop_ns = rate.last_span_ns
-        return max(self._rates, key=lambda other: other.merit(start_ns, stop_ns)) is rate
+        merit_ns = rate.merit_ns(start_ns, stop_ns)
+        for other in self._rates:
+            ahead_ns = other.merit_ns(start_ns, stop_ns) - merit_ns
+            if other is rate:
+                continue
+            if abs(other.duration_ns / rate.duration_ns - 1.0) < ALIKE:
+                # Both read the same signal, one of them a moment later.
+                if ahead_ns >= -other.duration_ns and other.clock_error < rate.clock_error:
+                    return False
+            elif ahead_ns > 0:
+                return False
+        return True
 
     def _slower_had_their_chance(self, rate: _Rate, now_ns: int) -> bool:
         since_ns = now_ns if self._held_since_ns is None else self._held_since_ns

@@ -28,7 +28,7 @@ Added to the paper's rules:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -56,8 +56,7 @@ _UNKNOWN = -(1 << 61)
 """Time of the last change of the level, before there was one."""
 
 
-@dataclass(frozen=True, slots=True)
-class Span:
+class Span(NamedTuple):
     """Where one character lies.
 
     Attributes:
@@ -109,10 +108,10 @@ class EndBitSynchroniser:
         self._t_end_ns = 0
 
     @property
-    def frame_start_ns(self) -> int | None:
-        """Start of the earliest character that is being received (ns), None while a falling edge is awaited."""
+    def needed_from_ns(self) -> int:
+        """Time (ns) from which on edges may still be needed: the earliest start of a character being received."""
         receiving = self._states[:, _IN_FRAME] != 0
-        return int(self._states[receiving, _START].min()) if receiving.any() else None
+        return int(np.where(receiving, self._states[:, _START], self._t_end_ns).min())
 
     def push(self, edges: Edges, t_end_ns: int) -> list[Span]:
         """Take the next edges and return the spans of the characters that are decided by now, in order of decision.
@@ -137,10 +136,11 @@ class EndBitSynchroniser:
 
 def _as_spans(rows: NDArray[np.int64]) -> list[Span]:
     spans = [
-        Span(start, stop, bool(start_seen), bool(stop_seen), decided, bool(by_edge), trial)
+        Span(start, stop, start_seen != 0, stop_seen != 0, decided, by_edge != 0, trial)
         for start, stop, start_seen, stop_seen, decided, by_edge, trial in rows.tolist()
     ]
-    spans.sort(key=lambda span: (span.decided_ns, span.by_edge, span.trial))
+    if len(spans) > 1:
+        spans.sort(key=lambda span: (span.decided_ns, span.by_edge, span.trial))
     return spans
 
 

@@ -114,11 +114,10 @@ class ThresholdDemodulator:
         before it ended takes that one's place.
         """
         edges = self._filter.push(t_ns, polarity)
+        if self._record.lacks_room(edges):
+            self._record.forget(self._synchroniser.needed_from_ns)
         self._record.append(edges)
-        readings = self._read(self._synchroniser.push(edges, t_end_ns))
-        start_ns = self._synchroniser.frame_start_ns
-        self._record.forget(t_end_ns if start_ns is None else start_ns)
-        return readings
+        return self._read(self._synchroniser.push(edges, t_end_ns))
 
     def flush_readings(self) -> list[Reading]:
         """End the stream; return readings as :meth:`push_readings` does."""
