@@ -15,13 +15,17 @@ from hypothesis import strategies as st  # noqa: E402
 from beacon_comm.core.candidates import BeaconState  # noqa: E402
 from beacon_comm.core.character import Character, Status  # noqa: E402
 from beacon_comm.core.errors import CalibrationError  # noqa: E402
+from beacon_comm.core.events import NS_PER_S  # noqa: E402
 from beacon_comm.core.receiver import BeaconSnapshot  # noqa: E402
 from beacon_comm.ros import conversions  # noqa: E402
+from beacon_comm.ros.beacon_node import guarded  # noqa: E402
 from beacon_comm.ros.camera import load_camera, resolve_url  # noqa: E402
+from beacon_comm.ros.report import Report  # noqa: E402
 from beacon_comm.ros.silence import Cause, Situation, why_silent  # noqa: E402
 from beacon_comm.ros.stamped import Instant, StampedCharacter  # noqa: E402
 from beacon_comm.ros.text import Texts, printable  # noqa: E402
 from beacon_comm.ros.throttled_log import ThrottledLog  # noqa: E402
+from beacon_comm.ros.topic import choose_type, message_class  # noqa: E402
 
 AT = Instant(1_700_000_000_123_456_789, 2**40)
 
@@ -183,6 +187,57 @@ def test_a_throttled_log_says_how_often_it_kept_quiet() -> None:
         log('a', 'text', now_ns)
     log('b', 'other', 150)
     assert lines == ['text', 'text (and 2 more since the last such line)', 'other']
+
+
+def test_whatever_goes_wrong_in_a_callback_the_node_goes_on() -> None:
+    lines: list[str] = []
+
+    class Node:
+        report = Report()
+        log_error = staticmethod(ThrottledLog(lines.append, NS_PER_S))
+
+        @guarded
+        def callback(self, divisor: int) -> None:
+            1 / divisor  # noqa: B018
+
+    node = Node()
+    for divisor in (0, 1, 0):
+        node.callback(divisor)
+    assert node.report.totals['internal_errors'] == 2
+    (line,) = lines
+    assert 'in callback' in line and 'ZeroDivisionError' in line
+
+
+# --- the type of the topic ---
+
+PACKETS, ARRAYS = 'event_camera_msgs/msg/EventPacket', 'dvs_msgs/msg/EventArray'
+
+
+@pytest.mark.parametrize(
+    ('advertised', 'current', 'not_installed', 'chosen'),
+    [
+        ((), None, '', None),
+        (('sensor_msgs/msg/Image',), None, '', None),
+        (('sensor_msgs/msg/Image', PACKETS), None, '', PACKETS),
+        ((PACKETS, ARRAYS), ARRAYS, '', ARRAYS),
+        ((PACKETS,), ARRAYS, '', PACKETS),
+        ((ARRAYS, PACKETS), None, ARRAYS, PACKETS),
+        ((ARRAYS,), None, ARRAYS, None),
+        (('someone_msgs/msg/EventArray',), None, '', 'someone_msgs/msg/EventArray'),
+    ],
+)
+def test_the_reader_follows_the_advertised_type(
+    advertised: tuple[str, ...], current: str | None, not_installed: str, chosen: str | None
+) -> None:
+    assert choose_type(advertised, current, not_installed) == chosen
+
+
+def test_a_types_class_is_found_by_its_name() -> None:
+    assert message_class('sensor_msgs/msg/CameraInfo').__name__ == 'CameraInfo'
+    with pytest.raises(ImportError, match='no_such_msgs'):
+        message_class('no_such_msgs/msg/EventArray')
+    with pytest.raises(ImportError, match='sensor_msgs.msg has no EventArray'):
+        message_class('sensor_msgs/msg/EventArray')
 
 
 # --- calibration ---

@@ -258,6 +258,7 @@ def test_a_beacon_is_read_confirmed_and_its_last_character_comes_out(
     check_a_late_listener_hears_what_is_confirmed(track_id)
     check_garbage_is_counted(peer, node)
     check_a_track_is_lost_once(peer, track_id)
+    check_another_driver_is_read(peer, track_id, stream)
 
     node.process.send_signal(signal.SIGINT)
     assert node.exit_code() == 0, node.output()
@@ -312,6 +313,17 @@ def check_a_track_is_lost_once(peer: Peer, track_id: int) -> None:
         if beacon.track_id == track_id
     ]
     assert states.count(messages.Beacon.LOST) == 1 and states[-1] == messages.Beacon.LOST
+
+
+def check_another_driver_is_read(peer: Peer, track_id: int, stream: list[bytes]) -> None:
+    """The publisher goes, another one comes and begins its time anew: the same beacon under a new label."""
+    peer.node.destroy_publisher(peer.publisher)
+    peer.advertise(EventPacket, '/camera/events', ReliabilityPolicy.BEST_EFFORT)
+    assert peer.spin_until(peer.publisher.get_subscription_count)
+    before = len(characters(peer))
+    publish(peer, stream[:60])
+    assert peer.spin_until(lambda: len(characters(peer)) > before + 40)
+    assert min(character.track_id for character in characters(peer)[before:]) > track_id
 
 
 def test_silence_is_explained_and_a_calibration_gives_bearings(

@@ -37,7 +37,7 @@ from beacon_comm.ros.report import Report
 from beacon_comm.ros.silence import Silence, Situation, why_silent
 from beacon_comm.ros.text import Texts
 from beacon_comm.ros.throttled_log import ThrottledLog
-from beacon_comm.ros.topic import Publishers, choose_type, find_publishers, message_class, similar_topics
+from beacon_comm.ros.topic import Publishers, choose_type, find_publishers, is_supported, similar_topics, subscribe_raw
 from beacon_comm.ros.warm_up import warm_up
 
 NODE_NAME = 'beacon_node'
@@ -100,6 +100,7 @@ class BeaconNode(Node):
         self._not_installed = ''
         self._found = Publishers()
         self._silence: Silence | None = None
+        self._only_refused = False
         self._subscription: Subscription | None = None
         self._make_publishers()
         self._make_inputs()
@@ -168,6 +169,7 @@ class BeaconNode(Node):
 
     def _publish(self, step: Step) -> None:
         """Publish what is due at once, keep the rest for the next turn of :meth:`_on_publish`."""
+        self.report.characters(len(step.characters))
         if step.characters:
             self._characters.publish(
                 conversions.characters_message(step.at, self._live.frame_id, step.characters)
@@ -207,31 +209,32 @@ class BeaconNode(Node):
     @guarded
     def _on_graph(self) -> None:
         self._found = find_publishers(self, self._topic, self._qos)
-        message_type = choose_type(self._found.types, self._type)
-        if message_type not in (None, self._type, self._not_installed):
+        message_type = choose_type(self._found.types, self._type, self._not_installed)
+        if message_type not in (None, self._type):
             self._subscribe(message_type)
 
     def _subscribe(self, message_type: str) -> None:
+        events = SubscriptionEventCallbacks(matched=self._on_matched, message_lost=self._on_message_lost)
         try:
-            cls = message_class(message_type)
+            subscription = subscribe_raw(self, message_type, self._topic, self._on_message, self._qos, events)
         except ImportError as error:
             self._not_installed = message_type
             self.get_logger().error(f'{self._topic} carries {message_type}, which is not installed here: {error}')
             return
         if self._subscription is not None:
             self.destroy_subscription(self._subscription)
-        self._type, self._not_installed = message_type, ''
-        self._publish(self._live.open(message_type, self._now_ns()))
-        events = SubscriptionEventCallbacks(matched=self._on_matched, message_lost=self._on_message_lost)
-        self._subscription = self.create_subscription(
-            cls, self._topic, self._on_message, self._qos, raw=True, event_callbacks=events
-        )
+        self._subscription, self._type, self._not_installed = subscription, message_type, ''
+        self._open_stream()
         self.get_logger().info(f'reading {self._topic} ({message_type})')
 
     @guarded
     def _on_matched(self, status: Any) -> None:
         """Begin a new stream where a publisher comes after the last one had gone."""
-        if self._type is not None and status.current_count == status.current_count_change == 1:
+        if status.current_count == status.current_count_change == 1:
+            self._open_stream()
+
+    def _open_stream(self) -> None:
+        if self._type is not None:
             self._publish(self._live.open(self._type, self._now_ns()))
 
     @guarded
@@ -243,11 +246,15 @@ class BeaconNode(Node):
     @guarded
     def _on_report(self) -> None:
         traffic, events, values = self.report.look(self._live, time.monotonic_ns())
+        if traffic.only_refused and self._only_refused:
+            self.get_logger().warning(f'{self._live.frame_id} is gone from {self._topic}: reading the other camera')
+            self._open_stream()
+        self._only_refused = traffic.only_refused
         unsubscribed = self._type not in self._found.types
         situation = Situation(
             topic=self._topic,
             advertised=self._found.types,
-            supported=choose_type(self._found.types, self._type) is not None,
+            supported=any(map(is_supported, self._found.types)),
             not_installed=self._not_installed if unsubscribed else '',
             incompatible=self._found.incompatible,
             similar=() if self._found.types else similar_topics(self, self._topic),

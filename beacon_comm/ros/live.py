@@ -11,6 +11,7 @@ It knows no ROS: the node gives it bytes and the time, and publishes what it ret
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 
 from beacon_comm.core.bearing import CameraModel
@@ -58,6 +59,7 @@ class LiveReceiver:
         self._parameters = parameters
         self._camera = camera
         self._stream: EventStream | None = None
+        self._past_counts: Counter[str] = Counter()
         self._receiver: Receiver | None = None
         self._time = StreamTime(silent_after_ns)
         self._clock_map = ClockMap()
@@ -69,9 +71,11 @@ class LiveReceiver:
         self.frame_id = ''
 
     @property
-    def counts(self) -> dict[str, int]:
-        """Counts by kind since the topic's reader was made."""
-        counts = {} if self._stream is None else dict(self._stream.counts)
+    def counts(self) -> Counter[str]:
+        """Counts by kind, over all streams."""
+        counts = self._past_counts.copy()
+        if self._stream is not None:
+            counts.update(self._stream.counts)
         counts['late_packets'] = self._time.late_packets
         return counts
 
@@ -92,6 +96,8 @@ class LiveReceiver:
 
     def open(self, message_type: str, now_ns: int) -> Step:
         """Read messages of this type from now on: another publisher, another stream; labels go on."""
+        if self._stream is not None:
+            self._past_counts.update(self._stream.counts)
         self._stream = EventStream(message_type)
         self._restart()
         return self._step(now_ns)

@@ -27,6 +27,11 @@ class Traffic:
     problems: Counter[str] = field(default_factory=Counter)
     longest_wait_s: float = 0.0
 
+    @property
+    def only_refused(self) -> bool:
+        """Whether every message was a second camera's."""
+        return 0 < self.messages == self.problems['refused_frames']
+
     def problem_text(self) -> str:
         """Return the kinds of problems and how often, most frequent first."""
         return ', '.join(f'{kind} ({count})' for kind, count in self.problems.most_common())
@@ -42,23 +47,25 @@ class Report:
         self._looked_ns: int | None = None
 
     def message(self, step: Step, waited_s: float) -> None:
-        """Count one message and what it gave."""
+        """Count one message."""
         self.traffic.messages += 1
-        self.traffic.characters += len(step.characters)
         self.traffic.longest_wait_s = max(self.traffic.longest_wait_s, waited_s)
-        self.totals['characters'] += len(step.characters)
         if step.problem is not None:
             self.traffic.bad_messages += 1
             self.traffic.problems[step.problem_kind] += 1
+
+    def characters(self, count: int) -> None:
+        """Count characters that were published."""
+        self.traffic.characters += count
+        self.totals['characters'] += count
 
     def look(self, live: LiveReceiver, now_ns: int) -> tuple[Traffic, int, dict[str, object]]:
         """Return the traffic since the last look, its events, and all values for ``/diagnostics``."""
         traffic, self.traffic = self.traffic, Traffic()
         counts = live.counts
-        total = counts.get('events', 0)
-        events = total - self._events if total >= self._events else total  # another stream counts from 0
+        events = counts['events'] - self._events
         seconds = (now_ns - self._looked_ns) / NS_PER_S if self._looked_ns is not None else 0.0
-        self._events, self._looked_ns = total, now_ns
+        self._events, self._looked_ns = counts['events'], now_ns
         tracks = live.beacons()
         states = Counter(track.state.name.lower() for track in tracks)
         values: dict[str, object] = {

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
+from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.node import Node
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
+from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from beacon_comm.wire.stream import SUPPORTED_TYPES, is_event_array_type
@@ -21,12 +24,10 @@ class Publishers:
 
     Attributes:
         types: their types, one entry a publisher.
-        gids: their identities.
         incompatible: why none of them fits our QoS, '' if one does or there is none.
     """
 
     types: tuple[str, ...] = ()
-    gids: frozenset[bytes] = field(default_factory=frozenset)
     incompatible: str = ''
 
 
@@ -35,11 +36,11 @@ def is_supported(message_type: str) -> bool:
     return message_type in SUPPORTED_TYPES or is_event_array_type(message_type)
 
 
-def choose_type(advertised: tuple[str, ...], current: str | None) -> str | None:
+def choose_type(advertised: tuple[str, ...], current: str | None, not_installed: str = '') -> str | None:
     """Return the type to subscribe: the current one while anyone advertises it, else the first that can be read."""
     if current in advertised:
         return current
-    return next((name for name in advertised if is_supported(name)), None)
+    return next((name for name in advertised if is_supported(name) and name != not_installed), None)
 
 
 def message_class(message_type: str) -> Any:
@@ -55,13 +56,32 @@ def message_class(message_type: str) -> Any:
         raise ImportError(f'{package}.msg has no {name}') from error
 
 
+def subscribe_raw(
+    node: Node,
+    message_type: str,
+    topic: str,
+    callback: Callable[[bytes, dict[str, int]], None],
+    qos: QoSProfile,
+    events: SubscriptionEventCallbacks,
+) -> Subscription:
+    """Subscribe to a topic's CDR bytes; without ``events`` where the middleware does not know them.
+
+    Raises:
+        ImportError: the type's package is not installed.
+    """
+    cls = message_class(message_type)
+    try:
+        return node.create_subscription(cls, topic, callback, qos, raw=True, event_callbacks=events)
+    except UnsupportedEventTypeError:
+        return node.create_subscription(cls, topic, callback, qos, raw=True)
+
+
 def find_publishers(node: Node, topic: str, qos: QoSProfile) -> Publishers:
     """Look at the graph: the publishers of a resolved topic name, against the QoS we ask for."""
     infos = node.get_publishers_info_by_topic(topic)
     mismatches = [_mismatch(info, qos) for info in infos]
     return Publishers(
         types=tuple(info.topic_type for info in infos),
-        gids=frozenset(bytes(info.endpoint_gid) for info in infos),
         incompatible='; '.join(filter(None, mismatches)) if mismatches and all(mismatches) else '',
     )
 

@@ -1,0 +1,245 @@
+"""The live receiver without DDS: messages and time in, characters with both clocks' times out."""
+
+import os
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from beacon_comm.core.bearing import CameraModel
+from beacon_comm.core.events import NS_PER_S, EventBatch
+from beacon_comm.core.framing import CharacterFrame, transitions
+from beacon_comm.core.parameters import Parameters
+from beacon_comm.ros.live import LiveReceiver, Step
+from beacon_comm.ros.report import Report
+from beacon_comm.ros.warm_up import warm_up
+from beacon_comm.wire.cdr import build_event_packet
+from beacon_comm.wire.evt3_encoder import Evt3Encoder
+
+TYPE = 'event_camera_msgs/msg/EventPacket'
+STAMP_NS = 1_700_000_000 * NS_PER_S
+START_NS = 3 * NS_PER_S
+MS = 1_000_000
+PACKET_NS = 5 * MS
+BIT_RATE = 3125.0
+TEXT = 2 * "Shall I compare thee to a summer's day?\n"
+
+
+def beacon_events(text: str = TEXT, start_ns: int = START_NS) -> EventBatch:
+    """Return a beacon's events: at every edge each pixel of a square fires once; time ends with the last of them."""
+    edges_ns, levels = transitions(CharacterFrame().encode_bits(text), BIT_RATE, start_ns)
+    columns, rows = (grid.ravel() for grid in np.meshgrid(np.arange(20, 27), np.arange(10, 17)))
+    pixels = len(columns)
+    t_ns = (edges_ns[:, None] + np.linspace(20_000, 120_000, pixels)).astype(np.int64) // 1000 * 1000
+    return EventBatch(
+        np.tile(columns, len(edges_ns)).astype(np.uint16),
+        np.tile(rows, len(edges_ns)).astype(np.uint16),
+        np.repeat(np.where(levels > 0, 1, -1), pixels).astype(np.int8),
+        t_ns.ravel(),
+        int(t_ns[-1, -1]),
+    )
+
+
+def packets(
+    events: EventBatch, size: tuple[int, int] = (64, 48), offset_ns: int = STAMP_NS - START_NS, frame_id: str = 'cam'
+) -> list[bytes]:
+    """Cut events into packets; a stamp is its packet's first event's time plus ``offset_ns``, or 0 below that."""
+    encoder = Evt3Encoder(*size)
+    cuts = np.searchsorted(events.t_ns, np.arange(events.t_ns[0], events.t_end_ns + PACKET_NS, PACKET_NS))
+    cuts[-1] = len(events)
+    made = []
+    for start, stop in zip(cuts[:-1].tolist(), cuts[1:].tolist(), strict=True):
+        part = events.slice(start, stop, int(events.t_ns[stop - 1]))
+        stamp_ns = max(0, int(part.t_ns[0]) + offset_ns)
+        made.append(
+            build_event_packet(stamp_ns, frame_id, *size, len(made), 0, 'evt3', encoder.encode(part))
+        )
+    return made
+
+
+class Session:
+    """A live receiver, its clock and everything it gave."""
+
+    def __init__(self, camera: CameraModel | None = None, bit_rates: tuple[float, ...] = (BIT_RATE,)) -> None:
+        self.live = LiveReceiver(Parameters(bit_rates=bit_rates), 50 * MS, camera)
+        self.now_ns = STAMP_NS
+        self.steps: list[Step] = [self.live.open(TYPE, self.now_ns)]
+
+    def push(self, stream: list[bytes]) -> None:
+        for message in stream:
+            self.steps.append(self.live.push(message, self.now_ns))
+            self.now_ns += PACKET_NS
+
+    def wait(self, seconds: float) -> None:
+        for _ in range(round(seconds / 0.025)):
+            self.now_ns += 25 * MS
+            step = self.live.tick(self.now_ns, 25 * MS)
+            if step is not None:
+                self.steps.append(step)
+
+    def text(self, first_step: int = 0) -> str:
+        return ''.join(chr(stamped.character.code) for step in self.steps[first_step:] for stamped in step.characters)
+
+    def track_ids(self, first_step: int = 0) -> set[int]:
+        return {stamped.track_id for step in self.steps[first_step:] for stamped in step.characters}
+
+
+def test_the_last_character_needs_no_further_packet() -> None:
+    session = Session()
+    session.push(packets(beacon_events()))
+    assert session.text() == TEXT[:-1]
+    session.wait(0.15)
+    assert session.text() == TEXT
+
+
+def test_flush_gives_out_what_was_held_until_the_bit_rate_is_settled() -> None:
+    session = Session(bit_rates=(504.0, BIT_RATE))
+    session.push(packets(beacon_events(TEXT[:8])))
+    session.wait(0.1)
+    held = session.text()
+    session.steps.append(session.live.flush(session.now_ns))
+    assert held != session.text() == TEXT[:8]
+
+
+def test_every_stamp_is_its_own_packets() -> None:
+    session = Session()
+    session.push(packets(beacon_events()))
+    session.wait(3.0)
+    for step in session.steps[1:]:
+        assert step.at.ros_ns - step.at.sensor_ns == STAMP_NS - START_NS
+        for stamped in step.characters:
+            assert stamped.at.ros_ns - stamped.at.sensor_ns == STAMP_NS - START_NS
+            assert stamped.at.sensor_ns == stamped.character.t_ns
+    times = [step.at.ros_ns for step in session.steps[1:]]
+    assert times == sorted(times)
+    assert len([lost for step in session.steps for lost in step.lost]) == 1
+
+
+def test_a_driver_that_stamps_zero_gets_the_time_of_arrival() -> None:
+    session = Session()
+    session.now_ns = STAMP_NS + 7
+    session.push(packets(beacon_events(), offset_ns=-(10**18)))
+    first = next(stamped for step in session.steps for stamped in step.characters)
+    assert first.at.ros_ns == pytest.approx(STAMP_NS + 7, abs=2 * MS)
+
+
+def test_a_stalled_publisher_costs_some_characters_and_no_more() -> None:
+    """The packets after a pause of 0.4 s hold events of a time that had been announced as silent."""
+    session = Session()
+    stream = packets(beacon_events(4 * TEXT))
+    session.push(stream[:80])
+    session.wait(0.4)
+    session.push(stream[80:])
+    session.wait(1.0)  # it waits longer now that it has seen a stall
+    assert session.live.counts['late_packets'] == 1
+    text = session.text()
+    assert text[:100] == (4 * TEXT)[:100] and text[-100:] == (4 * TEXT)[-100:]
+    assert len(session.track_ids()) == 1
+    for step in session.steps:
+        for stamped in step.characters:
+            # True sensor time all through: the n-th bit of the text is where it was sent.
+            position = (stamped.at.sensor_ns - START_NS) * BIT_RATE / NS_PER_S / 11
+            assert position % 1.0 < 0.1 or position % 1.0 > 0.9 or 115 < position < 140
+
+
+def test_another_publisher_begins_a_new_stream_and_labels_go_on() -> None:
+    session = Session()
+    session.push(packets(beacon_events()))
+    before = len(session.steps)
+    session.steps.append(session.live.open(TYPE, session.now_ns))
+    assert [lost.track_id for lost in session.steps[-1].lost] == list(session.track_ids(0))
+    session.push(packets(beacon_events(start_ns=NS_PER_S), frame_id='another', offset_ns=STAMP_NS))
+    session.wait(0.15)
+    assert session.text(before).endswith(TEXT)
+    assert min(session.track_ids(before + 1)) > max(session.track_ids() - session.track_ids(before + 1))
+    assert session.live.frame_id == 'another'
+    assert session.steps[-1].at.sensor_ns < START_NS
+
+
+def test_a_restarted_sensor_begins_a_new_time_and_labels_go_on() -> None:
+    session = Session()
+    session.push(packets(beacon_events()))
+    before = len(session.steps)
+    session.push(packets(beacon_events(start_ns=NS_PER_S), offset_ns=STAMP_NS))
+    session.wait(0.15)
+    assert session.live.counts['restarts'] == 1
+    assert session.text(before).endswith(TEXT[10:])
+    times = [step.at.ros_ns for step in session.steps[1:]]
+    assert times == sorted(times)
+
+
+def test_a_changed_sensor_size_loses_the_tracks() -> None:
+    session = Session()
+    session.push(packets(beacon_events()))
+    later = beacon_events(start_ns=START_NS + NS_PER_S)
+    session.push(packets(later, size=(128, 96)))
+    assert session.live.sensor_size == (128, 96)
+    assert sum(len(step.lost) for step in session.steps) == 1
+    assert session.live.beacons()
+
+
+def test_a_bad_message_is_told_and_forgotten() -> None:
+    session = Session()
+    stream = packets(beacon_events())
+    session.push([*stream[:3], b'\x00\x01', stream[3][:50], *stream[3:]])
+    session.wait(0.15)
+    assert session.text() == TEXT
+    problems = [step for step in session.steps if step.problem is not None]
+    assert [step.problem_kind for step in problems] == ['bad_messages'] * 2
+    report = Report()
+    for step in session.steps:
+        report.message(step, waited_s=0.001)
+    traffic, events, values = report.look(session.live, NS_PER_S)
+    assert (traffic.bad_messages, traffic.problem_text()) == (2, 'bad_messages (2)')
+    assert events == len(beacon_events()) == values['events']
+
+
+def test_a_calibration_of_another_sensor_is_not_used() -> None:
+    k = [50.0, 0.0, 32.0, 0.0, 50.0, 24.0, 0.0, 0.0, 1.0]
+    fitting = Session(CameraModel.from_camera_info(64, 48, 'plumb_bob', [], k))
+    other = Session(CameraModel.from_camera_info(640, 480, 'plumb_bob', [], k))
+    for session in (fitting, other):
+        session.push(packets(beacon_events()))
+    assert fitting.live.calibrated and fitting.live.beacons()[0].bearing is not None
+    assert not other.live.calibrated and other.live.beacons()[0].bearing is None
+    assert '640' in other.live.camera_problem
+    other.live.set_camera(CameraModel.from_camera_info(64, 48, 'plumb_bob', [], k))
+    assert other.live.calibrated and other.live.beacons()[0].bearing is not None
+
+
+def test_without_messages_there_is_nothing() -> None:
+    session = Session()
+    session.wait(1.0)
+    assert len(session.steps) == 1
+    assert session.live.flush(STAMP_NS).characters == ()
+    assert session.live.beacons() == () and session.live.confirmed == ()
+
+
+@pytest.mark.parametrize('bit_rates', [(20.0,), (504.0, 3125.0), (10_000.0,)])
+def test_the_warm_up_takes_every_bit_rate(bit_rates: tuple[float, ...]) -> None:
+    warm_up(Parameters(bit_rates=bit_rates))
+
+
+def test_a_cache_that_cannot_be_made_is_replaced(tmp_path: Path) -> None:
+    """Where neither the source's folder nor the user's can be written, the temporary folder takes the kernels."""
+    blocked = tmp_path / 'a file'
+    blocked.write_text('')
+    folder = Path(_cache_folder(blocked / 'cache', tmp_path))
+    assert folder.parent == tmp_path and stat.S_IMODE(folder.stat().st_mode) == 0o700
+
+
+def _cache_folder(cache: Path, temporary: Path) -> str:
+    program = (
+        'from pathlib import Path\n'
+        'import beacon_comm.ros.compiler_cache as cache\n'
+        f'cache.PACKAGE = Path({str(cache)!r})\n'
+        'print(cache.ensure_compiler_cache())\n'
+    )
+    environment = {
+        **os.environ, 'XDG_CACHE_HOME': str(cache), 'NUMBA_CACHE_DIR': str(cache), 'TMPDIR': str(temporary)
+    }
+    done = subprocess.run([sys.executable, '-c', program], env=environment, capture_output=True, text=True, check=True)
+    return done.stdout.strip()
