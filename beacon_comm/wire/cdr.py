@@ -21,8 +21,8 @@ against the bytes that are there.  Payloads are views of the caller's bytes, not
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 import struct
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray

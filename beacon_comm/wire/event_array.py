@@ -12,13 +12,13 @@ and the array ends with the last event's polarity.
 
 from __future__ import annotations
 
-from numba import njit
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.wire.cdr import ArrayPacket
-from beacon_comm.wire.reading import CLAMPED, NO_TIME, OUTSIDE, EventColumns, OffsetClock, Reading, Tally
+from beacon_comm.wire.reading import CLAMPED, NO_TIME, OUTSIDE, EventColumns, OffsetClock, Reading, Tally, words_of
 
 
 class EventArrayDecoder:
@@ -35,7 +35,7 @@ class EventArrayDecoder:
             restarted = self._clock.follow(first_ns, False)
         columns = EventColumns(packet.event_count + 1)
         n = _decode(
-            packet.payload,
+            words_of(packet.payload, 'u1', 1),
             packet.event_count,
             packet.width,
             packet.height,

@@ -8,7 +8,7 @@
     VECT_8      5 | . . . . v v v v v v v v   the same with 8
     TIME_LOW    6 | t t t t t t t t t t t t   time, lower 12 bits (µs)
     TIME_HIGH   8 | t t t t t t t t t t t t   time, upper 12 bits (4096 µs); repeated every 16 µs or so
-    EXT_TRIGGER A | i i i i . . . . . . . e   an edge at a trigger input
+    EXT_TRIGGER A | i i i i . . . . . . . e   an edge at a trigger input; counted by the bit e
     OTHERS      E, CONTINUED 7, F             reports of the sensor: passed over
     any other                                 skipped and counted; 9 is padding on GigE cameras
 
@@ -26,11 +26,11 @@ a lower bound.  With the old lower bits a TIME_HIGH that came too early by one w
 
     inside a packet                  a fall by up to 1 s is a step back, any other a wrap (1 packet: 1 to 10 ms)
     first TIME_HIGH of a packet      host time tells how far the sensor should have moved on.  Of the two times that
-                                     the bits allow, the one nearer to that is taken.  A fall that is taken as a
-                                     wrap but is more than 1 s off the host time, is a restart, and so is a fall
-                                     by more than 1 s that is not taken as a wrap
+                                     the bits allow, the one nearer to that is taken.  It is a restart if that is a
+                                     step back by more than 1 s, or a wrap that runs ahead of host time by more
 
-Without host time (equal stamps) a fall by more than half the range is a wrap.
+Without host time (equal stamps) a fall by more than half the range is a wrap.  Where seq fell, too, any step back
+and any difference from host time above 1 s is a restart.  After a restart all is as at the start.
 
 *Order.*  Times are given out as the running maximum: events behind a step back are clamped and counted, and what the
 time words have reached is a time that no later event undercuts.
@@ -38,17 +38,17 @@ time words have reached is a time that no later event undercuts.
 
 from __future__ import annotations
 
-from numba import njit
 import numpy as np
+from numba import njit
 
 from beacon_comm.core.events import EventBatch
 from beacon_comm.wire.cdr import Packet
 from beacon_comm.wire.reading import (
     CLAMPED,
-    FALLING,
     OUTSIDE,
-    RISING,
     SKIPPED,
+    TRIGGER_0,
+    TRIGGER_1,
     UNDECODED,
     Continuity,
     EventColumns,
@@ -69,10 +69,12 @@ _VECTOR_MARGIN = 12
 _HIGH_US, _LOW_US, _TIMED, _ROW, _BASE, _POLARITY, _LATEST_US = range(7)
 _STATE_SIZE = 7
 _UNKNOWN = -1
+_NO_BITS, _HIGH_BITS, _ALL_BITS = range(3)
+"""What of the time was seen since the start, or since packets were missing."""
 _NO_ROW = 1 << 16
 _NO_BASE = 1 << 40
-# How a packet follows the one before, and what became of it.
-_ELAPSED_US, _SEQ_FELL, _RESTARTED = range(3)
+# How a packet follows the one before; whether it had a TIME_HIGH yet; whether that told of a restart.
+_ELAPSED_US, _SEQ_FELL, _FOLLOWED, _RESTARTED = range(4)
 
 
 class Evt3Decoder:
@@ -80,7 +82,7 @@ class Evt3Decoder:
 
     def __init__(self) -> None:
         self._state = np.zeros(_STATE_SIZE, np.int64)
-        self._link = np.zeros(3, np.int64)
+        self._link = np.zeros(4, np.int64)
         self._state[_HIGH_US] = self._state[_LATEST_US] = _UNKNOWN
         self._forget()
 
@@ -88,10 +90,10 @@ class Evt3Decoder:
         """Decode a packet; see the module's head."""
         if continuity.packets_missing or continuity.seq_fell:
             self._forget()
-        words = words_of(packet.payload, np.uint16, 2)
+        words = words_of(packet.payload, '<u2', 2)
         columns = EventColumns(_capacity(words))
         link = self._link
-        link[_ELAPSED_US], link[_SEQ_FELL], link[_RESTARTED] = continuity.elapsed_ns // 1000, continuity.seq_fell, 0
+        link[:] = continuity.elapsed_ns // 1000, continuity.seq_fell, 0, 0
         n = _decode(
             words,
             packet.width,
@@ -113,7 +115,7 @@ class Evt3Decoder:
 
     def _forget(self) -> None:
         """Forget what words set up, but for the upper time bits."""
-        self._state[_TIMED] = 0
+        self._state[_TIMED] = _NO_BITS
         self._state[_ROW] = _NO_ROW
         self._state[_BASE] = _NO_BASE
 
@@ -131,56 +133,59 @@ def _capacity(words):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _follow_high(last_us, high_us, inside_packet, elapsed_us, seq_fell):  # type: ignore[no-untyped-def]
+def _follow_high(last_us, high_us, link):  # type: ignore[no-untyped-def]
     """Return the unwrapped time of a TIME_HIGH and whether it tells of a restart; see the module's head.
 
     ``last_us`` is the unwrapped time of the TIME_HIGH before, ``high_us`` the new one's bits (< 2²⁴).
     """
     forward_us = (high_us - last_us) % PERIOD_US
     back_us = PERIOD_US - forward_us
+    if link[_FOLLOWED]:
+        return (last_us - back_us if back_us <= STEP_BACK_US else last_us + forward_us), False
+    elapsed_us = link[_ELAPSED_US]
+    seq_fell = link[_SEQ_FELL] != 0
     fell = high_us < last_us % PERIOD_US
-    if inside_packet:
-        if back_us <= STEP_BACK_US:
-            return last_us - back_us, False
-        return last_us + forward_us, False
-    nearer_back = forward_us - elapsed_us > back_us + elapsed_us
-    off_us = abs(forward_us - elapsed_us)
-    if nearer_back and (fell or back_us <= STEP_BACK_US):
+    back_is_nearer = forward_us - elapsed_us >= back_us + elapsed_us
+    if back_is_nearer and (fell or back_us <= STEP_BACK_US):
         if back_us > STEP_BACK_US or seq_fell:
             return high_us, True
         return last_us - back_us, False
-    if off_us > STEP_BACK_US and ((fell and elapsed_us > 0) or seq_fell):
+    ahead_us = forward_us - elapsed_us
+    if (fell and elapsed_us > 0 and ahead_us > STEP_BACK_US) or (seq_fell and abs(ahead_us) > STEP_BACK_US):
         return high_us, True
     return last_us + forward_us, False
 
 
 @njit(cache=True, nogil=True)
-def _await_time(words, state, link, tally):  # type: ignore[no-untyped-def]
-    """Go through words until TIME_HIGH and then TIME_LOW were seen; return the place of the word after it."""
-    seen_high = False
-    for i in range(len(words)):
+def _start_anew(state, link):  # type: ignore[no-untyped-def]
+    """Forget everything: the sensor was restarted."""
+    state[_HIGH_US] = state[_LATEST_US] = _UNKNOWN
+    state[_LOW_US], state[_TIMED] = 0, _NO_BITS
+    state[_ROW], state[_BASE] = _NO_ROW, _NO_BASE
+    link[_RESTARTED] = 1
+
+
+@njit(cache=True, nogil=True)
+def _await_time(words, start, state, link, tally):  # type: ignore[no-untyped-def]
+    """Go on to the first TIME_LOW after a TIME_HIGH; return the place behind it, or the end."""
+    for i in range(start, len(words)):
         word = np.int64(words[i])
         code = word >> 12
-        value = word & 0xFFF
         if code == TIME_HIGH:
-            high_us = value << 12
-            if state[_HIGH_US] == _UNKNOWN:
-                state[_HIGH_US] = high_us
-            else:
-                time_us, restarted = _follow_high(
-                    state[_HIGH_US], high_us, seen_high, link[_ELAPSED_US], link[_SEQ_FELL] != 0
-                )
-                state[_HIGH_US] = time_us
+            high_us = (word & 0xFFF) << 12
+            if state[_HIGH_US] != _UNKNOWN:
+                high_us, restarted = _follow_high(state[_HIGH_US], high_us, link)
                 if restarted:
-                    link[_RESTARTED] = 1
-                    state[_LATEST_US] = _UNKNOWN
-            seen_high = True
-            state[_LATEST_US] = max(state[_LATEST_US], state[_HIGH_US])
+                    _start_anew(state, link)
+            link[_FOLLOWED] = 1
+            state[_TIMED] = _HIGH_BITS
+            state[_HIGH_US] = high_us
+            state[_LATEST_US] = max(state[_LATEST_US], high_us)
         elif code == TIME_LOW:
-            if seen_high:
-                state[_LOW_US] = value
-                state[_TIMED] = 1
-                state[_LATEST_US] = max(state[_LATEST_US], state[_HIGH_US] + value)
+            if state[_TIMED] == _HIGH_BITS:
+                state[_LOW_US] = word & 0xFFF
+                state[_TIMED] = _ALL_BITS
+                state[_LATEST_US] = max(state[_LATEST_US], state[_HIGH_US] + state[_LOW_US])
                 return i + 1
         elif code == ADDR_Y:
             state[_ROW] = word & 0x7FF
@@ -189,11 +194,11 @@ def _await_time(words, state, link, tally):  # type: ignore[no-untyped-def]
             state[_POLARITY] = ((word >> 10) & 2) - 1
         elif code == ADDR_X:
             tally[UNDECODED] += 1
-        elif code == VECT_12 or code == VECT_8:
+        elif code in (VECT_12, VECT_8):
             columns = 12 if code == VECT_12 else 8
-            for column in range(columns):
-                tally[UNDECODED] += (word >> column) & 1
             state[_BASE] += columns
+            for k in range(columns):
+                tally[UNDECODED] += (word >> k) & 1
         else:
             _count_other(code, word, tally)
     return len(words)
@@ -202,98 +207,92 @@ def _await_time(words, state, link, tally):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _count_other(code, word, tally):  # type: ignore[no-untyped-def]
     if code == EXT_TRIGGER:
-        tally[RISING if word & 1 else FALLING] += 1
+        tally[TRIGGER_1 if word & 1 else TRIGGER_0] += 1
     elif code != OTHERS and code != CONTINUED_4 and code != CONTINUED_12:
         tally[SKIPPED] += 1
 
 
 @njit(cache=True, nogil=True)
+def _spread(  # type: ignore[no-untyped-def]
+    word, columns, base, row, sign, now_ns, width, height, x, y, polarity, t_ns, n, tally
+):
+    """Write a vector's events behind the first ``n``; return the new number."""
+    bits = 0
+    start = n
+    for k in range(columns):
+        bit = (word >> k) & 1
+        x[n] = base + k
+        y[n] = row
+        polarity[n] = sign
+        t_ns[n] = now_ns
+        bits += bit
+        n += bit & (base + k < width) & (row < height)
+    if n - start < bits:
+        known = row != _NO_ROW and base < _NO_BASE
+        tally[OUTSIDE if known else UNDECODED] += bits - (n - start)
+    return n
+
+
+@njit(cache=True, nogil=True)
 def _decode(words, width, height, state, link, x, y, polarity, t_ns, tally):  # type: ignore[no-untyped-def]
     """Decode a packet's words into the columns; return the number of events."""
-    start = 0
-    inside_packet = False
-    if state[_TIMED] == 0:
-        start = _await_time(words, state, link, tally)
-        inside_packet = True
-    high_us = state[_HIGH_US]
-    low_us = state[_LOW_US]
-    row = state[_ROW]
-    base = state[_BASE]
-    sign = state[_POLARITY]
-    latest_us = state[_LATEST_US]
-    # A repeated TIME_HIGH, three words of ten, is passed over like OTHERS.
-    same_high = np.int64(TIME_HIGH << 12) | ((high_us >> 12) & 0xFFF)
+    i = _await_time(words, 0, state, link, tally) if state[_TIMED] != _ALL_BITS else 0
+    high_us, low_us, latest_us = state[_HIGH_US], state[_LOW_US], state[_LATEST_US]
+    row, base, sign = state[_ROW], state[_BASE], state[_POLARITY]
+    now_us = high_us + low_us
+    same_high = TIME_HIGH << 12 | ((high_us >> 12) & 0xFFF)
     n = 0
-    clamped = 0
-    i = start
     while i < len(words):
         word = np.int64(words[i])
         i += 1
         code = word >> 12
-        if code == ADDR_X or code == ADDR_Y or code == TIME_LOW or word == same_high:
-            # The words of a stream without vectors, without branches: each is written as if it were an event, and
-            # kept if it is one.  Branches on the code would be mispredicted at every third word.
-            row = word & 0x7FF if code == ADDR_Y else row
-            low_us = word & 0xFFF if code == TIME_LOW else low_us
+        if code == ADDR_X:
+            column = word & 0x7FF
+            if column < width and row < height:
+                x[n] = column
+                y[n] = row
+                polarity[n] = ((word >> 10) & 2) - 1
+                t_ns[n] = latest_us * 1000
+                tally[CLAMPED] += now_us < latest_us
+                n += 1
+            else:
+                tally[UNDECODED if row == _NO_ROW else OUTSIDE] += 1
+        elif code == ADDR_Y:
+            row = word & 0x7FF
+        elif code == TIME_LOW:
+            low_us = word & 0xFFF
             now_us = high_us + low_us
             latest_us = max(latest_us, now_us)
-            column = word & 0x7FF
-            is_event = code == ADDR_X
-            inside = (column < width) & (row < height)
-            x[n] = column
-            y[n] = row
-            polarity[n] = ((word >> 10) & 2) - 1
-            t_ns[n] = latest_us * 1000
-            kept = is_event & inside
-            clamped += kept & (now_us < latest_us)
-            n += kept
-            if is_event and not inside:
-                tally[UNDECODED if row == _NO_ROW else OUTSIDE] += 1
+        elif word == same_high:
+            continue
         elif code == TIME_HIGH:
-            time_us, restarted = _follow_high(
-                high_us, (word & 0xFFF) << 12, inside_packet, link[_ELAPSED_US], link[_SEQ_FELL] != 0
-            )
-            inside_packet = True
-            high_us = time_us
-            low_us = 0
-            same_high = word
+            high_us, restarted = _follow_high(high_us, (word & 0xFFF) << 12, link)
+            link[_FOLLOWED] = 1
             if restarted:
                 # What came before belongs to the sensor's life before; so does the state.
                 tally[UNDECODED] += n
                 n = 0
-                clamped = 0
-                link[_RESTARTED] = 1
-                state[_HIGH_US], state[_LATEST_US] = high_us, high_us
-                state[_ROW], state[_BASE] = _NO_ROW, _NO_BASE
-                i += _await_time(words[i - 1 :], state, link, tally) - 1
-                high_us, low_us, row = state[_HIGH_US], state[_LOW_US], state[_ROW]
-                base, sign, latest_us = state[_BASE], state[_POLARITY], state[_LATEST_US]
-                same_high = np.int64(TIME_HIGH << 12) | ((high_us >> 12) & 0xFFF)
-            latest_us = max(latest_us, high_us)
-        elif code == VECT_12 or code == VECT_8:
-            columns = 12 if code == VECT_12 else 8
+                _start_anew(state, link)
+                i = _await_time(words, i - 1, state, link, tally)
+                high_us, low_us, latest_us = state[_HIGH_US], state[_LOW_US], state[_LATEST_US]
+                row, base, sign = state[_ROW], state[_BASE], state[_POLARITY]
+            else:
+                low_us = np.int64(0)
             now_us = high_us + low_us
-            before = n
-            bits = 0
-            for k in range(columns):
-                bit = (word >> k) & 1
-                x[n] = base + k
-                y[n] = row
-                polarity[n] = sign
-                t_ns[n] = latest_us * 1000
-                bits += bit
-                n += bit & (base + k < width) & (row < height)
-            clamped += (n - before) * (now_us < latest_us)
-            if n - before < bits:
-                known = row != _NO_ROW and base < _NO_BASE
-                tally[OUTSIDE if known else UNDECODED] += bits - (n - before)
+            latest_us = max(latest_us, now_us)
+            same_high = TIME_HIGH << 12 | ((high_us >> 12) & 0xFFF)
+        elif code in (VECT_12, VECT_8):
+            columns = 12 if code == VECT_12 else 8
+            now_ns = latest_us * 1000
+            end = _spread(word, columns, base, row, sign, now_ns, width, height, x, y, polarity, t_ns, n, tally)
+            tally[CLAMPED] += (end - n) * (now_us < latest_us)
+            n = end
             base += columns
         elif code == VECT_BASE_X:
             base = word & 0x7FF
             sign = ((word >> 10) & 2) - 1
         else:
             _count_other(code, word, tally)
-    state[_HIGH_US], state[_LOW_US], state[_ROW] = high_us, low_us, row
-    state[_BASE], state[_POLARITY], state[_LATEST_US] = base, sign, latest_us
-    tally[CLAMPED] += clamped
+    state[_HIGH_US], state[_LOW_US], state[_LATEST_US] = high_us, low_us, latest_us
+    state[_ROW], state[_BASE], state[_POLARITY] = row, base, sign
     return n

@@ -11,8 +11,8 @@ reader follows across pauses of any length.
 
 from __future__ import annotations
 
-from numba import njit
 import numpy as np
+from numba import njit
 
 from beacon_comm.core.events import EventBatch
 from beacon_comm.wire.errors import WireError
@@ -99,7 +99,7 @@ def _encode(x, y, polarity, t_us, reached_us, start_us, end_us, words):  # type:
     if start_us != now_us:
         n = _move_on(now_us, start_us, words, n)
         now_us = start_us
-    row = -1
+    row = np.int64(-1)
     k = 0
     while k < len(x):
         if t_us[k] != now_us:
@@ -111,7 +111,7 @@ def _encode(x, y, polarity, t_us, reached_us, start_us, end_us, words):  # type:
             n += 1
         on = np.int64(polarity[k] > 0) << 11
         base = np.int64(x[k])
-        bits = 1
+        bits = np.int64(1)
         run = 1
         while (
             k + run < len(x)

@@ -22,8 +22,8 @@ Time starts anew at time_base in every packet; the column and the vector's base 
 
 from __future__ import annotations
 
-from numba import njit
 import numpy as np
+from numba import njit
 
 from beacon_comm.wire.cdr import Packet
 from beacon_comm.wire.reading import (
@@ -56,7 +56,7 @@ class LibcaerDecoder:
 
     def decode(self, packet: Packet, continuity: Continuity, tally: Tally) -> Reading:
         """Decode a packet.  The time base is far behind the events, so that an empty packet moves nothing on."""
-        halves = words_of(packet.payload, np.uint32, 8)
+        halves = words_of(packet.payload, '<u4', 8)
         base_ns = packet.time_base_ns
         first_us = int(halves[1]) & 0x7FFF_FFFF if len(halves) else 0
         restarted = len(halves) > 0 and self._clock.follow(base_ns + first_us * 1000, continuity.seq_fell)
@@ -89,7 +89,7 @@ class LibcaerCmpDecoder:
         restarted = self._clock.follow(packet.time_base_ns, continuity.seq_fell)
         if continuity.packets_missing or continuity.seq_fell or restarted:
             self._forget()
-        words = words_of(packet.payload, np.uint16, 2)
+        words = words_of(packet.payload, '<u2', 2)
         columns = EventColumns(_capacity(words))
         n, latest_ns = _decode_cmp(
             words,
@@ -151,14 +151,16 @@ def _capacity(words):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _decode_cmp(words, width, height, base_ns, latest_ns, state, x, y, polarity, t_ns, tally):  # type: ignore[no-untyped-def]
+def _decode_cmp(  # type: ignore[no-untyped-def]
+    words, width, height, base_ns, latest_ns, state, x, y, polarity, t_ns, tally
+):
     """Decode libcaer_cmp words; return the number of events and the latest time (ns)."""
     high_us = np.int64(0)
     low_us = np.int64(0)
     column, base, sign = state[_COLUMN], state[_BASE], state[_POLARITY]
     latest_ns = max(latest_ns, base_ns)
     now_ns = base_ns
-    n = 0
+    n = np.int64(0)
     for i in range(len(words)):
         word = np.int64(words[i])
         code = word >> 12
@@ -175,7 +177,7 @@ def _decode_cmp(words, width, height, base_ns, latest_ns, state, x, y, polarity,
                 tally[UNDECODED if column == _NO_COLUMN else OUTSIDE] += 1
         elif code == ADDR_X:
             column = word & 0x7FF
-        elif code == TIME_LOW or code == TIME_HIGH:
+        elif code in (TIME_LOW, TIME_HIGH):
             if code == TIME_LOW:
                 low_us = word & 0xFFF
             else:
@@ -189,7 +191,7 @@ def _decode_cmp(words, width, height, base_ns, latest_ns, state, x, y, polarity,
             sign = ((word >> 10) & 2) - 1
         elif code == VECT_8:
             before = n
-            bits = 0
+            bits = np.int64(0)
             for k in range(8):
                 bit = (word >> k) & 1
                 x[n] = column

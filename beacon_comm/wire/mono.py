@@ -6,8 +6,8 @@
 
 from __future__ import annotations
 
-from numba import njit
 import numpy as np
+from numba import njit
 
 from beacon_comm.wire.cdr import Packet
 from beacon_comm.wire.reading import CLAMPED, OUTSIDE, Continuity, EventColumns, OffsetClock, Reading, Tally, words_of
@@ -22,7 +22,7 @@ class MonoDecoder:
     def decode(self, packet: Packet, continuity: Continuity, tally: Tally) -> Reading:
         """Decode a packet; an empty one moves time on to its time base."""
         # A payload is aligned to 4 bytes in its message, not to 8: the words are read as halves.
-        halves = words_of(packet.payload, np.uint32, 8)
+        halves = words_of(packet.payload, '<u4', 8)
         base_ns = packet.time_base_ns
         restarted = len(halves) > 0 and self._clock.follow(base_ns + int(halves[0]), continuity.seq_fell)
         columns = EventColumns(len(halves) // 2 + 1)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beacon_comm.core.events import EventBatch
-from beacon_comm.wire.cdr import ArrayPacket, Packet
+from beacon_comm.wire.cdr import Packet
 
 RESTART_STEP_NS = 1_000_000_000
 """A sensor whose event time steps back by more than this was restarted; by less, the events are clamped."""
@@ -17,14 +17,14 @@ NO_TIME = -(1 << 62)
 """Stands for a time not known yet, below every real one; small enough that differences do not overflow."""
 
 # Places in a tally, the counters of the compiled loops.
-OUTSIDE, UNDECODED, CLAMPED, SKIPPED, RISING, FALLING = range(6)
+OUTSIDE, UNDECODED, CLAMPED, SKIPPED, TRIGGER_0, TRIGGER_1 = range(6)
 TALLY_KINDS = (
     'outside_events',
     'undecoded_events',
     'clamped_times',
     'skipped_words',
-    'rising_triggers',
-    'falling_triggers',
+    'triggers_0',
+    'triggers_1',
 )
 Tally = NDArray[np.int64]
 
@@ -86,10 +86,14 @@ class EventColumns:
         return EventBatch(*columns, t_end_ns)
 
 
-def words_of(payload: NDArray[np.uint8], dtype: type[np.uint16] | type[np.uint32], word_bytes: int) -> NDArray:
-    """Return whole words of ``word_bytes`` as little-endian numbers, ``(n,)``, in memory that is aligned for them."""
-    words = payload[: len(payload) // word_bytes * word_bytes].view(np.dtype(dtype).newbyteorder('<'))
-    return words if words.flags.aligned else words.copy()
+def words_of(payload: NDArray[np.uint8], dtype: str, word_bytes: int) -> NDArray:
+    """Return whole words of ``word_bytes`` as little-endian numbers, ``(n,)``, aligned and read-only."""
+    words = payload[: len(payload) // word_bytes * word_bytes].view(dtype)
+    if not words.flags.aligned:
+        words = words.copy()
+    # Of one type whatever the message's bytes are, or each kind of buffer would be compiled for anew.
+    words.flags.writeable = False
+    return words
 
 
 class OffsetClock:
@@ -117,24 +121,3 @@ class OffsetClock:
             return Reading(None, restarted, odd_bytes)
         return Reading(columns.batch(n, self.latest_ns), restarted, odd_bytes)
 
-
-__all__ = [
-    'CLAMPED',
-    'FALLING',
-    'NO_TIME',
-    'OUTSIDE',
-    'RESTART_STEP_NS',
-    'RISING',
-    'SKIPPED',
-    'TALLY_KINDS',
-    'UNDECODED',
-    'ArrayPacket',
-    'Continuity',
-    'EventColumns',
-    'OffsetClock',
-    'Packet',
-    'PayloadDecoder',
-    'Reading',
-    'Tally',
-    'words_of',
-]

@@ -57,8 +57,8 @@ COUNTS: Mapping[str, str] = {
     'outside_events': 'events outside the sensor',
     'undecoded_events': 'events before time, row or vector base was known, or before a restart in their packet',
     'clamped_times': 'events whose time would step back; they got the time reached',
-    'rising_triggers': 'rising edges at a trigger input',
-    'falling_triggers': 'falling edges at a trigger input',
+    'triggers_0': 'edges at a trigger input whose edge bit is 0',
+    'triggers_1': 'edges at a trigger input whose edge bit is 1',
 }
 """Kind -> meaning of what an EventStream counts."""
 
