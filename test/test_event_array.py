@@ -43,7 +43,10 @@ def decode(cdr: bytes, decoder: EventArrayDecoder | None = None) -> tuple[Readin
 
 rows = st.lists(
     st.tuples(
-        st.integers(0, 639), st.integers(0, 479), st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1), st.sampled_from([-1, 1])
+        st.integers(0, 639),
+        st.integers(0, 479),
+        st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1),
+        st.sampled_from([-1, 1]),
     ),
     max_size=8,
 ).map(lambda drawn: sorted(drawn, key=lambda row: row[2]))

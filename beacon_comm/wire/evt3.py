@@ -264,7 +264,7 @@ def _decode(words, width, height, state, link, x, y, polarity, t_ns, tally):  # 
             now_us = high_us + low_us
             latest_us = max(latest_us, now_us)
         elif word == same_high:
-            continue
+            link[_FOLLOWED] = 1
         elif code == TIME_HIGH:
             high_us, restarted = _follow_high(high_us, (word & 0xFFF) << 12, link)
             link[_FOLLOWED] = 1
