@@ -105,46 +105,53 @@ def _close(mark, listed, spare, found, width, height, side):  # type: ignore[no-
     before, after = side // 2, side - 1 - side // 2
     wide = 0
     for i in range(found):
-        x = listed[i] % width
-        row = listed[i] - x
-        for p in range(row + max(x - before, 0), row + min(x + after, width - 1) + 1):
-            if not mark[p] & _WIDE:
-                mark[p] |= _WIDE
-                spare[wide] = p
+        p = np.int64(listed[i])
+        x = p - _row(p, width) * width
+        for q in range(p - min(before, x), p + min(after, width - 1 - x) + 1):
+            if not mark[q] & _WIDE:
+                mark[q] |= _WIDE
+                spare[wide] = q
                 wide += 1
     dilated = 0
     for i in range(wide):
-        y = spare[i] // width
-        for row in range(max(y - before, 0), min(y + after, height - 1) + 1):
-            p = spare[i] + (row - y) * width
-            if not mark[p] & _DILATED:
-                mark[p] |= _DILATED
-                listed[dilated] = p
+        p = np.int64(spare[i])
+        y = _row(p, width)
+        for q in range(p - min(before, y) * width, p + min(after, height - 1 - y) * width + 1, width):
+            if not mark[q] & _DILATED:
+                mark[q] |= _DILATED
+                listed[dilated] = q
                 dilated += 1
     for i in range(dilated):
-        x = listed[i] % width
-        row = listed[i] - x
-        inside = True
-        for p in range(row + max(x - before, 0), row + min(x + after, width - 1) + 1):
-            inside &= (mark[p] & _DILATED) != 0
-        if inside:
-            mark[listed[i]] |= _NARROW
+        p = np.int64(listed[i])
+        x = p - _row(p, width) * width
+        common = _DILATED
+        for q in range(p - min(before, x), p + min(after, width - 1 - x) + 1):
+            common &= mark[q]
+        if common:
+            mark[p] |= _NARROW
     for i in range(dilated):
-        y = listed[i] // width
-        inside = (mark[listed[i]] & _NARROW) != 0
-        if inside:
-            for row in range(max(y - before, 0), min(y + after, height - 1) + 1):
-                inside &= (mark[listed[i] + (row - y) * width] & _NARROW) != 0
-        if inside:
-            mark[listed[i]] |= _CLOSED
+        p = np.int64(listed[i])
+        if mark[p] & _NARROW:
+            y = _row(p, width)
+            common = _NARROW
+            for q in range(p - min(before, y) * width, p + min(after, height - 1 - y) * width + 1, width):
+                common &= mark[q]
+            if common:
+                mark[p] |= _CLOSED
     closed = 0
     for i in range(dilated):
-        p = listed[i]
+        p = np.int64(listed[i])
         mark[p] &= _CLOSED
         if mark[p]:
             listed[closed] = p
             closed += 1
     return closed
+
+
+@njit(cache=True, nogil=True)
+def _row(p, width):  # type: ignore[no-untyped-def]
+    """Return p // width; the division of unsigned 32-bit numbers is several times as fast as that of int64."""
+    return np.int64(np.uint32(p) // np.uint32(width))
 
 
 @njit(cache=True, nogil=True)
@@ -160,41 +167,43 @@ def _label_components(  # type: ignore[no-untyped-def]
     m = 0
     end = 0
     for i in range(found):
-        if label[listed[i]]:
+        if not mark[listed[i]]:
             continue
         if m == room:
             room *= 2
             first = np.append(first, np.zeros(m, np.int64))
             sums = np.concatenate((sums, np.zeros((m, 10), np.int64)))
             index = np.append(index, np.zeros(m))
-        label[listed[i]] = m + 1
+        mark[listed[i]] = 0
         pixel[end] = listed[i]
         at, end = end, end + 1
-        s = sums[m]
-        s[LEFT], s[TOP] = width, height
+        seeds, n_sum, x_sum, y_sum, rr_sum, index_sum = 0, 0, 0, 0, 0, 0.0
+        left, right, top, bottom = width, 0, height, 0
         while at < end:
-            p = pixel[at]
+            p = np.int64(pixel[at])
             at += 1
-            mark[p] = 0
-            x, y = p % width, p // width
-            n = np.int64(counts[2 * p] + counts[2 * p + 1])
-            balance = abs(np.int64(counts[2 * p + 1] - counts[2 * p]))
-            index[m] += n / (offset + balance)
-            s[AREA] += 1
-            s[SEEDS] += n >= threshold * (offset + balance)
-            s[COUNT] += n
-            s[COUNT_X] += n * x
-            s[COUNT_Y] += n * y
-            s[COUNT_RR] += n * (x * x + y * y)
-            s[LEFT], s[RIGHT] = min(s[LEFT], x), max(s[RIGHT], x)
-            s[TOP], s[BOTTOM] = min(s[TOP], y), max(s[BOTTOM], y)
-            for row in range(max(y - 1, 0), min(y + 1, height - 1) + 1):
-                for q in range(row * width + max(x - 1, 0), row * width + min(x + 1, width - 1) + 1):
-                    if mark[q] and not label[q]:
-                        label[q] = m + 1
+            label[p] = m + 1
+            y = _row(p, width)
+            x = p - y * width
+            on, off = int(counts[2 * p + 1]), int(counts[2 * p])
+            n, base = on + off, offset + abs(on - off)
+            index_sum += n / base
+            seeds += n >= threshold * base
+            n_sum += n
+            x_sum += n * x
+            y_sum += n * y
+            rr_sum += n * (x * x + y * y)
+            left, right, top, bottom = min(left, x), max(right, x), min(top, y), max(bottom, y)
+            for row in range(p - min(1, y) * width, p + min(1, height - 1 - y) * width + 1, width):
+                for q in range(row - min(1, x), row + min(1, width - 1 - x) + 1):
+                    if mark[q]:
+                        mark[q] = 0
                         pixel[end] = q
                         end += 1
-        index[m] /= s[AREA]
+        s = sums[m]
+        s[AREA], s[SEEDS], s[COUNT], s[COUNT_X], s[COUNT_Y] = end - first[m], seeds, n_sum, x_sum, y_sum
+        s[COUNT_RR], s[LEFT], s[RIGHT], s[TOP], s[BOTTOM] = rr_sum, left, right, top, bottom
+        index[m] = index_sum / s[AREA]
         m += 1
         first[m] = end
     return first[: m + 1], sums[:m], index[:m]
