@@ -11,25 +11,13 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from beacon_comm.cli.publisher import PacedMessage, Playback, note, publish
-from beacon_comm.cli.progress import progress
-from beacon_comm.core.errors import BeaconCommError, ParameterError, RecordingError
-from beacon_comm.core.events import NS_PER_S
-from beacon_comm.recordings.bag_writer import BagWriter
-from beacon_comm.recordings.bags import Bag, open_recording
-from beacon_comm.recordings.disc import DEFAULT_RADIUS_PX, Disc
-from beacon_comm.recordings.interfaces import PACKET_TYPE
-from beacon_comm.recordings.scene import PACKET_PERIOD_S, Scene
-from beacon_comm.recordings.sources import Background, Clip, mat_beacon
-from beacon_comm.recordings.storage import TopicInfo
-from beacon_comm.recordings.truth import TRUTH_NAME, write_truth
+from beacon_comm.core.errors import BeaconCommError, ParameterError
 
 EVENT_TOPIC = '/event_camera/events'
-DEFAULT_SENSOR = (640, 480)
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
 
@@ -57,10 +45,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(own)
     try:
         _check(options)
-        if options.recordings[0].suffix == '.mat':
-            _replay_scene(options, ros)
-        else:
-            _replay_bag(options, ros)
+        from beacon_comm.cli.replaying import replay  # slow to import: after the options, and Ctrl-C stays clean
+
+        replay(options, ros)
     except BeaconCommError as error:
         print(f'beacon_replay: {error}', file=sys.stderr)
         return EXIT_ERROR
@@ -99,7 +86,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--background', type=Path, metavar='BAG', help='a bag of any supported encoding, looped')
     add('--background-topic', metavar='NAME', help="the background's event topic, if it has several")
     add('--sensor', type=_size, metavar='WxH', help="sensor size (default: the background's, or 640x480)")
-    add('--packet-period', type=float, default=PACKET_PERIOD_S, metavar='S', help='event time of a packet (default 0.004)')
+    add('--packet-period', type=float, default=0.004, metavar='S', help='event time of a packet (default 0.004)')
     add('--frame-id', metavar='NAME', help='frame of the messages (default event_camera)')
     add('--seed', type=int, default=0, help='seed of the pixels (default 0)')
     return parser
@@ -134,116 +121,6 @@ def _check(options: argparse.Namespace) -> None:
     for name in ('disc', 'clip', 'background', 'sensor', 'frame_id'):
         if getattr(options, name):
             raise ParameterError(f'--{name.replace("_", "-")} is for .mat recordings; a bag is published unchanged')
-
-
-def _replay_bag(options: argparse.Namespace, ros: Sequence[str]) -> None:
-    with open_recording(options.recordings[0]) as bag:
-        topic = bag.event_topic(options.topic)
-        whole = options.start == 0.0 and options.duration is None and not options.loop
-        messages = _bag_messages(bag, topic, options.start, options.duration, options.loop)
-        _deliver(options, ros, topic.name, topic.type, messages, topic.count or None if whole else None)
-
-
-def _bag_messages(
-    bag: Bag, topic: TopicInfo, start_s: float, duration_s: float | None, loop: bool
-) -> Iterator[PacedMessage]:
-    """Yield the part of a bag; a further pass is paced on from where the one before ended."""
-    shift_ns = 0
-    while True:
-        first_ns = last_ns = begin_ns = None
-        gap_ns = 0
-        for recorded_ns, cdr in bag.messages(topic):
-            first_ns = recorded_ns if first_ns is None else first_ns
-            since_ns = recorded_ns - first_ns - round(start_s * NS_PER_S)
-            if since_ns < 0:
-                continue
-            if duration_s is not None and since_ns >= duration_s * NS_PER_S:
-                break
-            if last_ns is None:
-                begin_ns = recorded_ns
-            else:
-                gap_ns = max(recorded_ns - last_ns, 0)
-            last_ns = recorded_ns
-            yield PacedMessage(recorded_ns + shift_ns, recorded_ns, cdr)
-        if not loop or last_ns is None or begin_ns is None:
-            return
-        shift_ns += last_ns - begin_ns + gap_ns
-
-
-def _replay_scene(options: argparse.Namespace, ros: Sequence[str]) -> None:
-    scene = make_scene(options)
-    count = scene.packet_count(options.start, options.duration)
-    packets = scene.packets(options.start, options.duration, options.loop)
-    messages = (PacedMessage(recorded_ns, recorded_ns, cdr) for recorded_ns, cdr in packets)
-    _deliver(options, ros, options.topic or EVENT_TOPIC, PACKET_TYPE, messages, None if options.loop else count)
-    if options.write is not None:
-        write_truth(options.write / TRUTH_NAME, scene, options.start, options.duration)
-
-
-def make_scene(options: argparse.Namespace) -> Scene:
-    """Build the scene that the options describe.
-
-    Raises:
-        RecordingError, ParameterError: a recording or an option that does not work.
-    """
-    background = None
-    if options.background is not None:
-        background = Background(options.background, options.background_topic)
-    natural = (background.width, background.height) if background is not None else DEFAULT_SENSOR
-    width, height = options.sensor or natural
-    beacons = []
-    for index, path in enumerate(options.recordings):
-        place = f'{(index + 1) * width // (len(options.recordings) + 1)},{height // 2},{DEFAULT_RADIUS_PX:g}'
-        disc = Disc.parse(options.disc[index] if index < len(options.disc) else place, width, height)
-        clip = Clip.parse(options.clip[index]) if index < len(options.clip) else Clip()
-        beacons.append(mat_beacon(path, disc, clip))
-    return Scene(
-        tuple(beacons),
-        width,
-        height,
-        background,
-        packet_period_ns=round(options.packet_period * 1e6) * 1000,
-        seed=options.seed,
-        frame_id=options.frame_id or 'event_camera',
-    )
-
-
-def _deliver(
-    options: argparse.Namespace,
-    ros: Sequence[str],
-    topic: str,
-    message_type: str,
-    messages: Iterator[PacedMessage],
-    total: int | None,
-) -> None:
-    if options.write is None:
-        publish(
-            Playback(
-                topic,
-                message_type,
-                messages,
-                total,
-                options.rate,
-                options.reliable,
-                options.clock,
-                options.wait_subscribers,
-            ),
-            ros,
-        )
-        return
-    stopped: BaseException | None = None
-    count = 0
-    with BagWriter(options.write) as writer:
-        writer.add_topic(topic, message_type)
-        try:
-            for message in progress(messages, str(options.write), total):
-                writer.write(topic, message.recorded_ns, message.cdr)
-                count += 1
-        except (RecordingError, KeyboardInterrupt) as error:
-            stopped = error  # what was written so far becomes a whole bag
-    note(f'{count} messages written to {options.write}')
-    if stopped is not None:
-        raise stopped
 
 
 if __name__ == '__main__':

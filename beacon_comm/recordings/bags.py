@@ -9,11 +9,11 @@ content: a file's suffix .zstd, a message's first four bytes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path, PurePath
 import re
 import shutil
 import sys
+from collections.abc import Iterator
+from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 
 import yaml

@@ -6,10 +6,10 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
-import sqlite3
 
 
 def topics(path: Path) -> Iterator[tuple[str, str, int]]:

@@ -9,11 +9,11 @@ Schemas are taken for their name only, never parsed.  Source: mcap.dev/spec.
 
 from __future__ import annotations
 
+import struct
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-import struct
-import sys
 from typing import BinaryIO
 from zlib import crc32
 

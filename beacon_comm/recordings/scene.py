@@ -17,8 +17,8 @@ import numpy as np
 
 from beacon_comm.core.errors import ParameterError
 from beacon_comm.core.events import NS_PER_S, EventBatch
-from beacon_comm.recordings.storage import Message
 from beacon_comm.recordings.sources import Background, Beacon
+from beacon_comm.recordings.storage import Message
 from beacon_comm.wire.cdr import build_event_packet
 from beacon_comm.wire.evt3_encoder import Evt3Encoder
 
