@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from beacon_comm.core.events import EventBatch
 from beacon_comm.ros.clock_map import MAX_ANCHORS, STEP_NS, ClockMap
-from beacon_comm.ros.stream_time import LONGEST_WAIT_NS, StreamTime
+from beacon_comm.ros.stream_time import LONGEST_LEARNT_LAG_NS, StreamTime
 
 MS = 1_000_000
 S = 1000 * MS
@@ -101,6 +101,7 @@ def test_memory_is_bounded() -> None:
 # --- the stream's time ---
 
 WAIT = 50 * MS
+LAG = 100 * MS
 PERIOD = 25 * MS
 
 
@@ -112,7 +113,7 @@ def carry_on(time: StreamTime, from_ns: int, until_ns: int) -> list[int]:
 
 
 def test_packets_on_time_pass_unchanged() -> None:
-    time = StreamTime(WAIT)
+    time = StreamTime(WAIT, LAG)
     for k in range(5):
         packet = batch(START + k * 10 * MS, START + (k * 10 + 9) * MS)
         assert time.admit(packet, STAMP + k * 10 * MS) is packet
@@ -122,39 +123,65 @@ def test_packets_on_time_pass_unchanged() -> None:
 
 
 def test_a_silent_topic_is_carried_on_behind_the_clock() -> None:
-    time = StreamTime(WAIT)
+    time = StreamTime(WAIT, LAG)
     time.admit(batch(START), STAMP)
     announced = carry_on(time, STAMP, STAMP + 200 * MS)
-    assert announced == [START + 25 * MS * k for k in range(1, 7)]
+    assert announced == [START + 25 * MS * k for k in range(1, 5)]
+
+
+def test_a_packet_late_by_less_than_the_lag_does_no_harm() -> None:
+    time = StreamTime(WAIT, LAG)
+    time.admit(batch(START), STAMP)
+    carry_on(time, STAMP, STAMP + LAG)
+    late = batch(START + 1 * MS, START + 4 * MS)
+    assert time.admit(late, STAMP + LAG) is late
+    assert time.late_packets == 0
+
+
+def test_a_topic_without_a_publisher_is_not_waited_for() -> None:
+    time = StreamTime(WAIT, LAG)
+    time.admit(batch(START), STAMP)
+    time.publisher_gone()
+    assert carry_on(time, STAMP, STAMP + 100 * MS) == [START + 25 * MS, START + 50 * MS]
+
+
+def test_a_stream_that_ends_is_carried_on_up_to_the_clock() -> None:
+    time = StreamTime(WAIT, LAG)
+    assert time.finish() is None
+    time.admit(batch(START), STAMP)
+    assert carry_on(time, STAMP, STAMP + 75 * MS) == []
+    end = time.finish()
+    assert end is not None and end.t_end_ns == START + 75 * MS
+    assert time.finish() is None
 
 
 def test_nothing_is_announced_before_the_first_packet() -> None:
-    time = StreamTime(WAIT)
+    time = StreamTime(WAIT, LAG)
     assert time.tick(STAMP, PERIOD) is None
 
 
 def test_a_clock_that_stands_announces_nothing() -> None:
-    time = StreamTime(WAIT)
+    time = StreamTime(WAIT, LAG)
     time.admit(batch(START), STAMP)
     assert all(time.tick(STAMP, PERIOD) is None for _ in range(100))
 
 
 def test_a_clock_that_runs_fast_or_jumps_announces_no_more_than_the_ticks() -> None:
-    time = StreamTime(WAIT)
+    time = StreamTime(WAIT, LAG)
     time.admit(batch(START), STAMP)
-    announced = [time.tick(STAMP + k * 10 * S, PERIOD) for k in range(1, 5)]
+    announced = [time.tick(STAMP + k * 10 * S, PERIOD) for k in range(1, 7)]
     assert [tick.t_end_ns - START for tick in announced if tick is not None] == [25 * MS, 50 * MS]
 
 
 def test_a_clock_that_jumps_back_does_no_harm() -> None:
-    time = StreamTime(WAIT)
+    time = StreamTime(WAIT, LAG)
     time.admit(batch(START), STAMP)
     assert time.tick(STAMP - 1000 * S, PERIOD) is None
-    assert carry_on(time, STAMP - 1000 * S, STAMP - 1000 * S + 100 * MS)
+    assert carry_on(time, STAMP - 1000 * S, STAMP - 1000 * S + 200 * MS)
 
 
 def test_a_late_packet_keeps_its_shape_and_its_sensor_time() -> None:
-    time = StreamTime(WAIT)
+    time = StreamTime(WAIT, LAG)
     time.admit(batch(START), STAMP)
     announced_ns = carry_on(time, STAMP, STAMP + 200 * MS)[-1]
     late = batch(START + 1 * MS, START + 4 * MS, end_ns=START + 10 * MS)
@@ -167,15 +194,15 @@ def test_a_late_packet_keeps_its_shape_and_its_sensor_time() -> None:
 
 
 def test_a_topic_with_slow_packets_is_late_once() -> None:
-    time = StreamTime(WAIT)
+    time = StreamTime(WAIT, LAG)
     for k in range(20):
-        time.admit(batch(START + 100 * k * MS, end_ns=START + 100 * (k + 1) * MS - 1), STAMP + 100 * k * MS)
-        carry_on(time, STAMP + 100 * k * MS, STAMP + 100 * (k + 1) * MS)
+        time.admit(batch(START + 150 * k * MS, end_ns=START + 150 * (k + 1) * MS - 1), STAMP + 150 * k * MS)
+        carry_on(time, STAMP + 150 * k * MS, STAMP + 150 * (k + 1) * MS)
     assert time.late_packets <= 1
 
 
 def test_a_paused_bag_is_late_once_and_goes_on() -> None:
-    time = StreamTime(WAIT)
+    time = StreamTime(WAIT, LAG)
     time.admit(batch(START), STAMP)
     carry_on(time, STAMP, STAMP + 10 * S)
     now_ns = STAMP + 10 * S
@@ -183,11 +210,11 @@ def test_a_paused_bag_is_late_once_and_goes_on() -> None:
         admitted = time.admit(batch(START + (1 + 10 * k) * MS), now_ns + 10 * k * MS)
         assert time.sensor_ns(int(admitted.t_ns[0])) == START + (1 + 10 * k) * MS
     assert time.late_packets == 1
-    assert time._wait_ns <= LONGEST_WAIT_NS
+    assert time._lag_ns <= LONGEST_LEARNT_LAG_NS
 
 
 def test_a_packet_without_events_never_takes_the_time_back() -> None:
-    time = StreamTime(WAIT)
+    time = StreamTime(WAIT, LAG)
     time.admit(batch(START), STAMP)
     announced_ns = carry_on(time, STAMP, STAMP + 200 * MS)[-1]
     assert time.admit(batch(end_ns=START + MS), STAMP + 201 * MS).t_end_ns == announced_ns
@@ -207,7 +234,7 @@ def test_a_packet_without_events_never_takes_the_time_back() -> None:
     )
 )
 def test_the_stream_never_breaks_its_word(packets: list[tuple[int, int, list[int]]]) -> None:
-    time = StreamTime(WAIT)
+    time = StreamTime(WAIT, LAG)
     now_ns, sensor_ns, announced_ns = STAMP, START, -(2**63)
     for silence_ms, offset_ms, gaps_ms in packets:
         for end_ns in carry_on(time, now_ns, now_ns + silence_ms * MS):

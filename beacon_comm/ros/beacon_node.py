@@ -87,12 +87,12 @@ class BeaconNode(Node):
         self.log_warning = ThrottledLog(self.get_logger().warning, LOG_PERIOD_NS)
         self._log_silence = ThrottledLog(self.get_logger().warning, SILENCE_LOG_PERIOD_NS, counting=False)
         self._log_quiet = ThrottledLog(self.get_logger().info, SILENCE_LOG_PERIOD_NS, counting=False)
-        self._silent_ns = round(self._own.silent_clock_after_s * NS_PER_S)
         camera = load_camera(self._own.camera_info_file)
         if camera is None and not self._own.use_camera_info:
             self.get_logger().info('no calibration: bearings are pixels only (camera_info_file, use_camera_info)')
         self._warm_up()
-        self._live = LiveReceiver(self._core, self._silent_ns, camera)
+        silent_after_ns = round(self._own.silent_clock_after_s * NS_PER_S)
+        self._live = LiveReceiver(self._core, silent_after_ns, round(self._own.silent_clock_lag_s * NS_PER_S), camera)
         self._texts = Texts(self._own.text_codes)
         self._lost: list[BeaconSnapshot] = []
         self._topic = self.resolve_topic_name('events')
@@ -232,6 +232,8 @@ class BeaconNode(Node):
         """Begin a new stream where a publisher comes after the last one had gone."""
         if status.current_count == status.current_count_change == 1:
             self._open_stream()
+        elif status.current_count == 0:
+            self._live.publisher_gone()
 
     def _open_stream(self) -> None:
         if self._type is not None:

@@ -51,17 +51,19 @@ class LiveReceiver:
 
     Args:
         parameters: the receiver's.
-        silent_after_ns: see :class:`StreamTime`.
+        silent_after_ns, lag_ns: see :class:`StreamTime`.
         camera: calibration, None for pixels only.
     """
 
-    def __init__(self, parameters: Parameters, silent_after_ns: int, camera: CameraModel | None = None) -> None:
+    def __init__(
+        self, parameters: Parameters, silent_after_ns: int, lag_ns: int, camera: CameraModel | None = None
+    ) -> None:
         self._parameters = parameters
         self._camera = camera
         self._stream: EventStream | None = None
         self._past_counts: Counter[str] = Counter()
         self._receiver: Receiver | None = None
-        self._time = StreamTime(silent_after_ns)
+        self._time = StreamTime(silent_after_ns, lag_ns)
         self._clock_map = ClockMap()
         self._gathered: list[StampedCharacter] = []
         self._lost: list[BeaconSnapshot] = []
@@ -122,9 +124,16 @@ class LiveReceiver:
         self._gather(self._receiver.push(batch))
         return self._step(now_ns)
 
+    def publisher_gone(self) -> None:
+        """The topic's last publisher has gone: what is held need not wait for it any more."""
+        self._time.publisher_gone()
+
     def flush(self, now_ns: int) -> Step:
-        """End the stream: give out what is still held."""
+        """End the stream: give out what is due by the clock, and what is still held."""
         if self._receiver is not None:
+            batch = self._time.finish()
+            if batch is not None:
+                self._gather(self._receiver.push(batch))
             self._gather(self._receiver.flush())
         return self._step(now_ns)
 

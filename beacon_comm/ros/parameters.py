@@ -29,7 +29,10 @@ class NodeParameters(Declared):
     )
     qos_depth: int = parameter(1000, 'event messages that may wait for the node', 'messages', 1, 100_000)
     silent_clock_after_s: float = parameter(
-        0.05, 'a topic without messages for this long is silent: its time goes on by the clock', 's', 0.01, 10.0
+        0.05, 'a topic without messages for this long is silent: its time goes on by the clock …', 's', 0.01, 10.0
+    )
+    silent_clock_lag_s: float = parameter(
+        0.5, '… and stays so far behind it while there is a publisher, whose next message may be late', 's', 0.0, 10.0
     )
     camera_info_file: str = parameter(
         '', "calibration YAML of the event camera: a path, a file:// or a package:// URL; '': pixels only"
