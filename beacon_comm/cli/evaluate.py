@@ -11,7 +11,7 @@ from beacon_comm.cli.parameter_arguments import add_parameter_arguments, paramet
 from beacon_comm.core.errors import BeaconCommError, RecordingError
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.parameters import Parameters
-from beacon_comm.evaluation.report import published_table, recordings_table, scores_table, texts_table
+from beacon_comm.evaluation.report import listed, published_table, recordings_table, scores_table, texts_table
 from beacon_comm.evaluation.result import RecordingResult
 from beacon_comm.evaluation.result_json import write_json
 from beacon_comm.evaluation.truth import load_truth
@@ -67,7 +67,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(arguments: argparse.Namespace) -> int:
     # Imported here: the kernels' libraries take a second, and --help and wrong arguments need none of them.
-    from beacon_comm.cli.offline import Options, evaluate_recording, warm_up
+    from beacon_comm.cli.offline import Options, evaluate_recording, is_mat, warm_up
     from beacon_comm.core.bearing import CameraModel
 
     if arguments.start < 0.0 or (arguments.duration is not None and arguments.duration <= 0.0):
@@ -83,7 +83,7 @@ def _run(arguments: argparse.Namespace) -> int:
         arguments.start,
         arguments.duration,
     )
-    warm_up(parameters)
+    warm_up(parameters, bags=not all(map(is_mat, arguments.recordings)))
     results: list[RecordingResult] = []
     code = EXIT_OK
     for recording in arguments.recordings:
@@ -96,20 +96,27 @@ def _run(arguments: argparse.Namespace) -> int:
         if result.problem is not None:
             code = _complain(result.problem)
     if results:
-        print_results(results, options.truth is not None)
+        whole = arguments.start == 0.0 and arguments.duration is None
+        print_results(results, options.truth is not None, whole and arguments.truth == 'sonnet18')
         if arguments.json is not None:
             write_json(arguments.json, results)
     return code
 
 
-def print_results(results: Sequence[RecordingResult], scored: bool) -> None:
-    """Print the tables of one or several recordings."""
+def print_results(results: Sequence[RecordingResult], scored: bool, comparable: bool) -> None:
+    """Print the tables of one or several recordings.
+
+    Args:
+        results: at least one.
+        scored: whether there was a truth.
+        comparable: whether they can stand beside the paper's figures.
+    """
     print(recordings_table(results))
-    if any(result.beacons for result in results):
+    if any(listed(result) for result in results):
         print('\n' + texts_table(results))
     if scored and any(beacon.transmissions for result in results for beacon in result.beacons):
         print('\n' + scores_table(results))
-        published = published_table(results)
+        published = published_table(results) if comparable else None
         if published is not None:
             print("\nThe last transmission beside the paper's figures (section IV, outdoor):\n" + published)
     elif scored:

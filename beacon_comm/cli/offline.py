@@ -29,6 +29,8 @@ from beacon_comm.evaluation.result import BeaconResult, RecordingResult
 from beacon_comm.evaluation.scoring import Transmission, not_found, score
 from beacon_comm.recordings.bags import open_recording
 from beacon_comm.recordings.mat import read_mat
+from beacon_comm.wire.cdr import build_event_packet
+from beacon_comm.wire.stream import ENCODINGS, PACKET_TYPES, EventStream
 
 SAMPLE_NS = 20_000_000
 MAT_BATCH_NS = 100_000_000
@@ -67,14 +69,24 @@ def evaluate_recording(path: str, options: Options) -> RecordingResult:
     Raises:
         BeaconCommError: nothing of it can be read, or the truth cannot be framed.
     """
-    if path.lower().endswith('.mat'):
+    if is_mat(path):
         return _evaluate_mat(path, options)
     with open_recording(path) as bag:
         return _evaluate_bag(path, BagPieces(path, bag, options.topic, options.window_ns), options)
 
 
-def warm_up(parameters: Parameters) -> None:
-    """Compile the kernels on a made-up beacon, so that the first recording's speed is not the compiler's."""
+def is_mat(path: str) -> bool:
+    """Whether a recording is a MATLAB file, by its name."""
+    return path.lower().endswith('.mat')
+
+
+def warm_up(parameters: Parameters, bags: bool) -> None:
+    """Compile the kernels on a made-up beacon, so that the first recording's speed is not the compiler's.
+
+    Args:
+        parameters: the receiver's.
+        bags: whether there are bags to come; a ``.mat`` file needs neither pixels nor packets.
+    """
     bits = CharacterFrame.from_parameters(parameters).encode_bits('Warm up ' * 8)
     edges_ns, levels = transitions(bits, max(parameters.bit_rates), NS_PER_S)
     x, y = (grid.ravel().astype(np.uint16) for grid in np.meshgrid(np.arange(5, 10), np.arange(5, 10)))
@@ -85,9 +97,22 @@ def warm_up(parameters: Parameters) -> None:
         np.repeat(edges_ns, len(x)),
         int(edges_ns[-1]) + NS_PER_S // 10,
     )
-    for receiver in (Receiver(parameters, (16, 16)), SignalReceiver(parameters)):
+    receivers = [SignalReceiver(parameters), Receiver(parameters, (16, 16))] if bags else [SignalReceiver(parameters)]
+    for receiver in receivers:
         receiver.push(batch)
         receiver.flush()
+    for encoding in ENCODINGS if bags else ():
+        packet = build_event_packet(
+            stamp_ns=0,
+            frame_id='',
+            width=16,
+            height=16,
+            seq=0,
+            time_base_ns=0,
+            encoding=encoding,
+            payload=bytes(64),
+        )
+        EventStream(PACKET_TYPES[0]).push(packet)
 
 
 def _evaluate_mat(path: str, options: Options) -> RecordingResult:

@@ -12,10 +12,10 @@ from beacon_comm.evaluation.result import BeaconResult, RecordingResult
 from beacon_comm.evaluation.scoring import Interval, Transmission
 
 SCORE_COLUMNS = (
-    'recording', 'track', 'state', 'bit/s', 'confirmed', 'start', 'characters', 'wrong', 'missing', 'inserted',
-    'wrong ok', 'repaired', 'message accuracy', 'bit accuracy',
+    'recording', 'track', 'start', 'bit/s', 'characters', 'wrong', 'missing', 'inserted', 'wrong ok', 'repaired',
+    'message accuracy', 'bit accuracy',
 )  # fmt: skip
-TEXT_COLUMNS = ('recording', 'track', 'state', 'bit/s', 'confirmed', 'bearing', 'characters', 'ok', 'text')
+TEXT_COLUMNS = ('recording', 'track', 'state', 'bit/s', 'confirmed', 'bearing', 'characters', 'ok', 'end of text')
 RECORDING_COLUMNS = (
     'recording', 'events', 'seconds', 'Mev/s', 'lost packets', 'skipped words', 'beacons', 'other tracks',
 )  # fmt: skip
@@ -44,7 +44,7 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a table with aligned columns; numbers and all but the first column stand right, texts left."""
     cells = [tuple(columns), *(tuple(row) for row in rows)]
     widths = [max(len(row[column]) for row in cells) for column in range(len(columns))]
-    left = {column for column, name in enumerate(columns) if name in ('recording', 'state', 'text')}
+    left = {column for column, name in enumerate(columns) if name in ('recording', 'state', 'end of text')}
     lines = [
         '  '.join(
             cell.ljust(width) if column in left else cell.rjust(width)
@@ -77,7 +77,7 @@ def recordings_table(results: Sequence[RecordingResult]) -> str:
 
 
 def scores_table(results: Sequence[RecordingResult]) -> str:
-    """Return one row a transmission; accuracies with their 95 % confidence intervals."""
+    """Return one row a transmission: its fitted start and rate, counts, accuracies with 95 % confidence intervals."""
     rows = []
     for result in results:
         for beacon in result.beacons:
@@ -86,16 +86,33 @@ def scores_table(results: Sequence[RecordingResult]) -> str:
 
 
 def texts_table(results: Sequence[RecordingResult]) -> str:
-    """Return one row a beacon: state, bearing and the end of its text."""
+    """Return one row a listed beacon: state, bearing and the end of its text."""
     rows = []
     for result in results:
-        for beacon in result.beacons:
+        for beacon in listed(result):
             ok = sum(character.status.name == 'OK' for character in beacon.characters)
             shown = repr(beacon.text[-SHOWN_TEXT:])[1:-1]
             rows.append(
-                (*_beacon_cells(result, beacon), _bearing(beacon), str(len(beacon.characters)), str(ok), shown)
+                (
+                    _name(result),
+                    str(beacon.track_id),
+                    beacon.state.name.lower(),
+                    '-' if beacon.bit_rate_bps is None else f'{beacon.bit_rate_bps:g}',
+                    '-' if beacon.confirmed_at_ns is None else f'{beacon.confirmed_at_ns / NS_PER_S:.3f} s',
+                    _bearing(beacon),
+                    str(len(beacon.characters)),
+                    str(ok),
+                    shown,
+                )
             )
     return table(TEXT_COLUMNS, rows)
+
+
+def listed(result: RecordingResult) -> tuple[BeaconResult, ...]:
+    """Return the beacons worth a row: confirmed or scored ones, and the only one of a recording."""
+    if len(result.beacons) == 1:
+        return result.beacons
+    return tuple(beacon for beacon in result.beacons if beacon.confirmed_at_ns is not None or beacon.transmissions)
 
 
 def published_table(results: Sequence[RecordingResult]) -> str | None:
@@ -130,20 +147,12 @@ def _name(result: RecordingResult) -> str:
     return PurePath(result.recording).name or result.recording
 
 
-def _beacon_cells(result: RecordingResult, beacon: BeaconResult) -> tuple[str, ...]:
+def _score_row(result: RecordingResult, beacon: BeaconResult, transmission: Transmission) -> tuple[str, ...]:
     return (
         _name(result),
         str(beacon.track_id),
-        beacon.state.name.lower(),
-        '-' if beacon.bit_rate_bps is None else f'{beacon.bit_rate_bps:g}',
-        '-' if beacon.confirmed_at_ns is None else f'{beacon.confirmed_at_ns / NS_PER_S:.3f} s',
-    )
-
-
-def _score_row(result: RecordingResult, beacon: BeaconResult, transmission: Transmission) -> tuple[str, ...]:
-    return (
-        *_beacon_cells(result, beacon),
         'not found' if transmission.start_ns is None else f'{transmission.start_ns / NS_PER_S:.3f} s',
+        '-' if transmission.bit_rate_bps is None else f'{transmission.bit_rate_bps:.2f}',
         str(transmission.characters),
         str(transmission.wrong),
         str(transmission.missing),
