@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beacon_comm.core.character import Character, Status
-from beacon_comm.core.confirmation import ParityRecord, Verdict, regular_share, repeats
+from beacon_comm.core.confirmation import ParityRecord, Verdict, comb_share, regular_share, repeats
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.parameters import Parameters
 
@@ -20,12 +20,14 @@ OK, PARITY, FRAMING, REPAIRED = Status.OK, Status.PARITY_ERROR, Status.FRAMING_E
 TEXT = "Shall I compare thee to a summer's day?\nThou art more lovely and more temperate:\nRough winds do shake the"
 
 
-def characters(text: Iterable[str], statuses: Iterable[Status] | None = None, first: int = 0) -> Iterator[Character]:
+def characters(
+    text: Iterable[str], statuses: Iterable[Status] | None = None, first: int = 0, confidence: float = 1.0
+) -> Iterator[Character]:
     """Yield a text's characters a frame apart, the ``first`` at T0 + first frames."""
     text = list(text)
     for k, (letter, status) in enumerate(zip(text, statuses or [OK] * len(text), strict=True)):
         t_ns = T0_NS + (first + k) * FRAME_NS
-        yield Character(t_ns, ord(letter), status, 1.0, FRAME.frame_of(ord(letter)), RATE_BPS)
+        yield Character(t_ns, ord(letter), status, confidence, FRAME.frame_of(ord(letter)), RATE_BPS)
 
 
 def verdicts(record: ParityRecord, stream: Iterable[Character]) -> dict[int, Verdict]:
@@ -162,6 +164,34 @@ def test_regular_falls_are_refused() -> None:
 
 def fall_spacings(frame: int) -> list[int]:
     return [len(run) for run in f'{frame:011b}'.replace('10', '1|0').split('|')]
+
+
+def test_edges_at_the_middles_of_bits_are_refused() -> None:
+    for confidence, confirmed in ((0.19, False), (0.21, True)):
+        record = ParityRecord(Parameters())
+        verdicts(record, characters(TEXT, confidence=confidence))
+        assert record.confirmed is confirmed
+
+
+def test_one_blurred_character_does_not_matter() -> None:
+    record = ParityRecord(Parameters())
+    stream = list(characters(TEXT[:15]))
+    stream[3:9] = list(characters(TEXT[:15], confidence=0.0))[3:9]
+    assert verdicts(record, stream) == {15: Verdict.CONFIRMED}
+
+
+def test_a_lamp_with_missed_edges_is_refused_unless_sharp() -> None:
+    """Three periods a frame: falls at 3 2/3 and 7 1/3 bits, some of them missed; seen with blurred edges only."""
+    lamp = '00110110011', '01111111111', '00000110011', '00110000011', '00110111111', '01111110011', '00000000011'
+    codes = [chr(FRAME.decode_frame(int(frame, 2))[0]) for frame in lamp]
+    assert comb_share([FRAME.frame_of(ord(code)) for code in codes], FRAME.length) == 1.0
+    stream = [codes[k] for k in np.random.default_rng(6).integers(len(codes), size=200)]
+    for confidence, confirmed in ((0.35, False), (0.6, True)):
+        record = ParityRecord(Parameters())
+        verdicts(record, characters(stream, confidence=confidence))
+        assert record.confirmed is confirmed
+    assert comb_share([FRAME.frame_of(ord(letter)) for letter in TEXT[:15]], FRAME.length) < 0.9
+    assert comb_share([], FRAME.length) == 0.0
 
 
 def test_regular_share_tells_a_lamp_from_a_text() -> None:

@@ -10,8 +10,9 @@ Every character that a demodulator gives out is *counted* (a silence gives none)
 A lamp is a valid sender, too: at each of its falls the same waveform lies ahead, so every character is synchronised
 and reads alike, with right parity if chance has it; an edge near the middle of a bit makes several codes of one.
 A line that changes at random gets one character in five ok.  So a character *vouches* for a beacon only if it is ok
-and did not slip in (see :meth:`ParityRecord.push`), and the codes that vouch have to vary as a text's do
-(:func:`repeats`, :func:`regular_share`).  ``docs/confirmation.md`` works out what is left to chance.
+and did not slip in (see :meth:`ParityRecord.push`); the edges of those that vouch have to lie nearer to the borders
+of the bits than to their middles (their confidence); and their codes have to vary as a text's do (:func:`repeats`,
+:func:`regular_share`, :func:`comb_share`).  ``docs/confirmation.md`` works out what is left to chance.
 """
 
 from __future__ import annotations
@@ -21,6 +22,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 from functools import lru_cache
+from statistics import median
+
+import numpy as np
+from numpy.typing import NDArray
 
 from beacon_comm.core.character import Character, Status
 from beacon_comm.core.events import NS_PER_S
@@ -47,6 +52,7 @@ class _Counted:
 
     code: int
     frame: int
+    confidence: float
     vouches: bool
 
 
@@ -60,9 +66,9 @@ class ParityRecord:
                ``judged_last`` parities right (REJECTED)
     candidate  fewer than ``judged_characters`` counted since the last judgement within       demoted
                ``starved_after_ns`` of time with events (STARVED)
-    candidate  ``confirm_ok`` of the last ``confirm_window`` vouch, with                      confirmed
-               ``confirm_distinct_codes`` codes that vary as a text's (CONFIRMED), unless
-               the same character rejects it
+    candidate  ``confirm_ok`` of the last ``confirm_window`` vouch, with a median             confirmed
+               confidence of ``confirm_confidence`` and ``confirm_distinct_codes`` codes that
+               vary as a text's (CONFIRMED), unless the same character rejects it
     confirmed  ``judged_characters`` in a row, at each of which < ``judged_right`` of the     demoted
                last ``judged_last`` parities were right (DEMOTED)
     confirmed  not one counted character within ``starved_after_ns`` of time with events      demoted
@@ -154,7 +160,7 @@ class ParityRecord:
             status is Status.OK or (status is Status.FRAMING_ERROR and self._layout.parity_bits > 0)
         )
         vouches = status is Status.OK and not self._slipped(character)
-        self._window.append(_Counted(character.code, character.frame, vouches))
+        self._window.append(_Counted(character.code, character.frame, character.confidence, vouches))
         self._last_start_ns = character.t_ns
 
     def _slipped(self, character: Character) -> bool:
@@ -183,13 +189,20 @@ class ParityRecord:
             return False
         if len({counted.code for counted in vouching}) < p.confirm_distinct_codes:
             return False
-        if p.allow_periodic:
-            return True
+        confidence = median(counted.confidence for counted in vouching)
+        if confidence < p.confirm_confidence:
+            return False
+        return p.allow_periodic or not self._could_be_a_lamp(vouching, confidence)
+
+    def _could_be_a_lamp(self, vouching: Sequence[_Counted], confidence: float) -> bool:
+        p = self._p
         codes = [counted.code if counted.vouches else None for counted in self._window]
-        return (
-            not any(repeats(codes, period, p.confirm_repeats) for period in range(1, p.confirm_period + 1))
-            and regular_share([counted.frame for counted in vouching], self._layout.length) <= p.confirm_regular
-        )
+        if any(repeats(codes, period, p.confirm_repeats) for period in range(1, p.confirm_period + 1)):
+            return True
+        frames = [counted.frame for counted in vouching]
+        if regular_share(frames, self._layout.length) > p.confirm_regular:
+            return True
+        return confidence < p.confirm_sharp and comb_share(frames, self._layout.length) > p.confirm_comb
 
 
 def repeats(codes: Sequence[int | None], period: int, share: float) -> bool:
@@ -226,10 +239,40 @@ def regular_share(frames: Sequence[int], length: int) -> float:
     ) / len(frames)
 
 
+def comb_share(frames: Sequence[int], length: int) -> float:
+    """Return the share of frames that one lamp could have sent of which edges were missed: all falls on one comb.
+
+    Every frame starts at a fall of the lamp, so its other falls are whole periods later, within half a bit; the period
+    is looked for that explains most frames.  Such a lamp stays in step with the frames only if some whole number of
+    its periods is a frame, and the falls between then lie off the borders of bits: a sharp signal is none.
+
+    Args:
+        frames: frames as read (first sent bit most significant).
+        length: bits of a frame.
+    """
+    if not frames:
+        return 0.0
+    explained = np.stack([_periods_of(frame, length) for frame in frames])
+    return float(explained.mean(axis=0).max())
+
+
+def _falls(frame: int, length: int) -> list[int]:
+    """Return the places (bit) in a frame where a 0 follows a 1."""
+    bits = [frame >> shift & 1 for shift in range(length - 1, -1, -1)]
+    return [k for k in range(1, length) if bits[k - 1] and not bits[k]]
+
+
 @lru_cache(maxsize=4096)
 def _fall_spacings(frame: int, length: int) -> tuple[int, int]:
     """Return the shortest and the longest spacing (bit) of a frame's falls: its start, those within, its end."""
-    bits = [frame >> shift & 1 for shift in range(length - 1, -1, -1)]
-    falls = [0, *(k for k in range(1, length) if bits[k - 1] and not bits[k]), length]
+    falls = [0, *_falls(frame, length), length]
     spacings = [late - early for early, late in zip(falls, falls[1:], strict=False)]
     return min(spacings), max(spacings)
+
+
+@lru_cache(maxsize=4096)
+def _periods_of(frame: int, length: int) -> NDArray[np.bool_]:
+    """Return which periods of 2 bits to a frame explain all falls within a frame, ``(n,)`` bool."""
+    periods = np.arange(2.0, length + 0.01, 0.05)
+    off = np.array([np.abs(fall - periods * np.rint(fall / periods)) for fall in _falls(frame, length)])
+    return np.all(off.reshape(-1, len(periods)) <= 0.5 + 1e-9, axis=0)

@@ -212,12 +212,35 @@ class Parameters(Declared):
     judged_characters: int = parameter(15, 'a candidate is judged after so many counted characters, and every so many', '', 1)
     judged_last: int = parameter(5, 'the judgement looks at so many last parities …', '', 1)
     judged_right: int = parameter(4, '… and demotes below so many right ones', '', 0)
-    starved_after_s: float = parameter(2.0, 'a candidate with too few characters to judge for this long is demoted', 's', 0.01)
+    starved_after_s: float = parameter(
+        2.0, 'a slot with too few characters to judge for this long, while there are events, is given up', 's', 0.01
+    )
+    starved_margin: float = parameter(
+        1.5, '… but not before so many times the duration of judged_characters at the slowest listed rate', '', 1.0, 100.0
+    )
+    turn_characters: int = parameter(
+        30, 'a candidate not confirmed by so many counted characters gives its slot to a waiting one', '', 1
+    )
     confirm_window: int = parameter(15, 'a confirmation looks at so many last characters …', '', 1)
     confirm_ok: int = parameter(12, '… of which so many are ok …', '', 1)
     confirm_distinct_codes: int = parameter(4, '… with so many distinct codes …', '', 1)
     confirm_period: int = parameter(3, '… that do not repeat with a period of so many characters or less', '', 0)
-    allow_periodic: bool = parameter(False, 'confirm streams that repeat with a short period, too')
+    confirm_repeats: float = parameter(
+        0.34, '… (repeats: more than this share of the ok characters equals the one a period before)', '', 0.0, 1.0
+    )
+    confirm_regular: float = parameter(
+        0.66, '… and of which no more than this share could be a lamp: falls at one constant spacing', '', 0.0, 1.0
+    )
+    confirm_confidence: float = parameter(
+        0.2, '… and whose median confidence is at least this …', '', 0.0, 1.0
+    )
+    confirm_sharp: float = parameter(
+        0.5, '… and at least this, or else …', '', 0.0, 1.0
+    )
+    confirm_comb: float = parameter(
+        0.9, '… no more than this share could be a lamp with missed edges: falls on one comb', '', 0.0, 1.0
+    )
+    allow_periodic: bool = parameter(False, 'confirm streams that repeat, fall regularly or on a comb, too')
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -234,6 +257,10 @@ class Parameters(Declared):
             raise ParameterError(f'min_area_px = {self.min_area_px}: above max_area_px = {self.max_area_px}')
         if self.judged_right > self.judged_last:
             raise ParameterError(f'judged_right = {self.judged_right}: above judged_last = {self.judged_last}')
+        if self.judged_last > self.judged_characters:
+            raise ParameterError(
+                f'judged_last = {self.judged_last}: above judged_characters = {self.judged_characters}'
+            )
         if self.confirm_ok > self.confirm_window:
             raise ParameterError(f'confirm_ok = {self.confirm_ok}: above confirm_window = {self.confirm_window}')
 
