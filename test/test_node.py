@@ -79,10 +79,10 @@ class NodeProcess:
 class Peer:
     """The other end: a driver and a listener in the test's own process."""
 
-    def __init__(self) -> None:
+    def __init__(self, name: str) -> None:
         self.context = rclpy.Context()
         self.context.init(domain_id=DOMAIN)
-        self.node = rclpy.create_node('test_peer', context=self.context)
+        self.node = rclpy.create_node(name, context=self.context)
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
         self.heard: dict[str, list[Any]] = defaultdict(list)
@@ -172,7 +172,15 @@ def domain() -> Iterator[None]:
 
 @pytest.fixture
 def peer(domain: None) -> Iterator[Peer]:
-    one = Peer()
+    one = Peer('test_peer')
+    yield one
+    one.close()
+
+
+@pytest.fixture
+def late(domain: None) -> Iterator[Peer]:
+    """A listener that has found the node, but subscribes later: discovery may take longer than a track lives."""
+    one = Peer('test_late')
     yield one
     one.close()
 
@@ -228,10 +236,13 @@ def values(peer: Peer) -> dict[str, str]:
 
 
 def test_a_beacon_is_read_confirmed_and_its_last_character_comes_out(
-    peer: Peer, start: Callable[..., NodeProcess]
+    peer: Peer, late: Peer, start: Callable[..., NodeProcess]
 ) -> None:
-    node = start('-r', 'events:=/camera/events', '-p', 'bit_rates:=[3125]', '-p', 'publish_rate_hz:=20')
+    node = start(
+        '-r', 'events:=/camera/events', '-p', 'bit_rates:=[3125]', '-p', 'publish_rate_hz:=20', '-p', 'lost_after_s:=4'
+    )
     connect(peer, node)
+    assert late.spin_until(lambda: late.node.count_publishers('/beacon_node/confirmed'))
     assert list(peer.heard['/beacon_node/confirmed'][0].track_ids) == []
     sent = 6 * TEXT
     stream = packets(beacon_events(sent, NS_PER_S, 30, 20))
@@ -255,7 +266,7 @@ def test_a_beacon_is_read_confirmed_and_its_last_character_comes_out(
     assert beacon.state == beacon.CONFIRMED and beacon.bit_rate_bps == pytest.approx(BIT_RATE, rel=0.01)
 
     check_times(peer)
-    check_a_late_listener_hears_what_is_confirmed(track_id)
+    check_a_late_listener_hears_what_is_confirmed(late, track_id)
     check_garbage_is_counted(peer, node)
     check_a_track_is_lost_once(peer, track_id)
     check_another_driver_is_read(peer, track_id, stream)
@@ -280,12 +291,10 @@ def check_times(peer: Peer) -> None:
             assert difference_ns == pytest.approx(OFFSET_NS, abs=1000)
 
 
-def check_a_late_listener_hears_what_is_confirmed(track_id: int) -> None:
-    late = Peer()
+def check_a_late_listener_hears_what_is_confirmed(late: Peer, track_id: int) -> None:
     late.listen('/beacon_node/confirmed', messages.Confirmed, latched=True)
     assert late.spin_until(lambda: late.heard['/beacon_node/confirmed'])
     assert list(late.heard['/beacon_node/confirmed'][0].track_ids) == [track_id]
-    late.close()
 
 
 def check_garbage_is_counted(peer: Peer, node: NodeProcess) -> None:
