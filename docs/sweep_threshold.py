@@ -23,12 +23,15 @@ from beacon_comm.core.parameters import Parameters
 from beacon_comm.evaluation.held import Signal
 from beacon_comm.evaluation.scoring import Transmission, score
 from beacon_comm.evaluation.truth import SONNET18
+from beacon_comm.recordings.disc import Disc
 from beacon_comm.recordings.mat import read_mat
+from beacon_comm.recordings.scene import Scene
+from beacon_comm.recordings.sources import Background, Clip, mat_beacon
 
 PROJECT = Path(__file__).resolve().parents[1]
 NAMES = ('504hz_30m.mat', '3125hz_30m.mat')
 CUTOFFS = {'1/3': 1 / 3, '1': 1.0, '1.5': 1.5, '2π/3': 2 * math.pi / 3, '2.5': 2.5, '3': 3.0, '4': 4.0}
-LOW_SHARES = (0.01, 0.02, 0.035, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3)
+LOW_SHARES = (0.01, 0.02, 0.035, 0.05, 0.07, 0.09, 0.1, 0.15, 0.2, 0.3)
 FIXED_LEVELS = ((4.0, -3.0), (6.0, -5.0), (10.0, -8.0), (20.0, -15.0), (30.0, -20.0), (50.0, -30.0))
 NOISE_SHARES = (0.0, 0.01, 0.03, 0.1)
 BATCH_NS = 4_000_000
@@ -56,7 +59,7 @@ def cells(t_ns: NDArray[np.int64], polarity: NDArray[np.int8], parameters: Param
         if not found:
             return 'not found'
         inserted = f' (+{found[-1].inserted})' if found[-1].inserted else ''
-        return f'{found[-1].characters - found[-1].wrong}{inserted} of {found[-1].characters}'
+        return f'{found[-1].characters - found[-1].wrong + found[-1].inserted}{inserted} of {found[-1].characters}'
 
     return right(last), f'{last[-1].bit_accuracy:.4f}' if last else '0.5', right(tail)
 
@@ -83,6 +86,25 @@ def with_noise(
     return times[order], signs[order]
 
 
+def before_a_lamp(folder: Path) -> tuple[tuple[NDArray[np.int64], NDArray[np.int8]], ...]:
+    """Return the events of a moving 504 bps beacon's routing circle, without and with lamps behind its path."""
+    background = Background(folder / 'evt3_static')
+    disc = Disc(250.0, 200.0, 4.0, 50.0, 0.0, background.width, background.height)
+    scene = Scene(
+        (mat_beacon(folder / NAMES[0], disc, Clip(12.3, 5.0)),), background.width, background.height, background
+    )
+    found = []
+    for view in (replace(scene, background=None), scene):
+        times, signs = [], []
+        for batch in view.batches():
+            x_px, y_px = disc.centre(batch.t_ns / NS_PER_S)
+            inside = np.hypot(batch.x - x_px, batch.y - y_px) <= 1.5 * disc.radius_px + 2.0
+            times.append(batch.t_ns[inside])
+            signs.append(batch.polarity[inside])
+        found.append((np.concatenate(times), np.concatenate(signs)))
+    return tuple(found)
+
+
 def nanoseconds_an_event(t_ns: NDArray[np.int64], polarity: NDArray[np.int8], bit_rate_bps: float) -> float:
     """Time the demodulator at one rate, the recording handed over at once."""
     ThresholdDemodulator(bit_rate_bps, Parameters()).push(t_ns[:100], polarity[:100], int(t_ns[-1]))  # compile
@@ -94,9 +116,10 @@ def nanoseconds_an_event(t_ns: NDArray[np.int64], polarity: NDArray[np.int8], bi
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    folder = os.environ.get('BEACON_COMM_DATA', PROJECT.parent / 'shared' / 'data')
-    parser.add_argument('--folder', type=Path, default=folder, help='folder of the recordings')
-    events = {name: read_mat(Path(parser.parse_args().folder) / name) for name in NAMES}
+    usual = os.environ.get('BEACON_COMM_DATA', PROJECT.parent / 'shared' / 'data')
+    parser.add_argument('--folder', type=Path, default=usual, help='folder of the recordings')
+    folder = Path(parser.parse_args().folder)
+    events = {name: read_mat(folder / name) for name in NAMES}
     slow, fast = (events[name] for name in NAMES)
     defaults = Parameters()
 
@@ -147,6 +170,13 @@ def main() -> None:
             f'{share:g}',
             *(cells(*with_noise(*signal, noise), setting)[0] for signal in (slow, fast) for noise in NOISE_SHARES),
         )
+
+    print('\n### A 504 bps beacon that moves past the lamps of evt3_static, α = 2π/3 f')
+    head('low share', 'without background', 'with')
+    views = before_a_lamp(folder)
+    for share in LOW_SHARES:
+        setting = replace(defaults, low_share=share, high_share=1.2 * share)
+        row(f'{share:g}', *(cells(*signal, setting)[0] for signal in views))
 
     print('\n### Cost')
     for (t_ns, polarity), bit_rate_bps in ((slow, 504.0), (fast, 3125.0)):

@@ -154,8 +154,8 @@ class Parameters(Declared):
     levels: str = parameter(
         'adaptive', "hysteresis levels: shares of the signal's own amplitude, or fixed", choices=('adaptive', 'fixed')
     )
-    high_share: float = parameter(0.06, "adaptive high level over the signal's amplitude", '', 0.0, 1.0)
-    low_share: float = parameter(0.05, "adaptive |low level| over the signal's amplitude", '', 0.0, 1.0)
+    high_share: float = parameter(0.12, "adaptive high level over the signal's amplitude", '', 0.0, 1.0)
+    low_share: float = parameter(0.1, "adaptive |low level| over the signal's amplitude", '', 0.0, 1.0)
     amplitude_memory_bits: float = parameter(100.0, 'time constant of the amplitude', 'bit', 1.0, 1e6)
     least_level: float = parameter(2.0, 'adaptive levels never come nearer to zero', 'events', 0.0)
     high_level: float = parameter(20.0, 'fixed high level of the filtered signal', 'events', 0.0)
