@@ -127,7 +127,7 @@ def published_table(results: Sequence[RecordingResult]) -> str | None:
         if paper is None or not transmissions:
             continue
         ours = transmissions[-1]
-        right = max(0, ours.characters - ours.wrong - ours.inserted) if ours.found else 0
+        right = max(0, ours.characters - ours.wrong) if ours.found else 0
         rows.append(
             (
                 PurePath(result.recording).stem,

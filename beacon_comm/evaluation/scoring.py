@@ -10,7 +10,7 @@ A *transmission* is one sending of the truth, or the part of one that the record
                 right    right │  missing   wrong │         the nearest in a window is its match
                             inserted           inserted     what matches nothing
 
-    message accuracy = 1 - (wrong + inserted) / characters    wrong: another code, or missing; not below 0
+    message accuracy = 1 - wrong / characters    wrong: another code, missing, or inserted; not below 0
     bit accuracy     = 1 - wrong bits / (11 · characters)     a missing character is 11 wrong bits; inserted have none
 
 A character is right if all of its data bits are (the published script's count; the parity bit does not matter).
@@ -70,8 +70,8 @@ class Transmission:
         bit_rate_bps: fitted bit rate f (bit/s); None: no start found.
         first: position in the truth of the first character that is held.
         characters: truth characters that are held.
-        wrong: of these, decoded as another code, or missing.
-        missing: of these, not decoded at all.
+        wrong: of these, decoded as another code, or missing; and what was inserted.
+        missing: of the characters that are held, not decoded at all.
         wrong_ok: wrong (not missing) ones with the status ok.
         repaired: matched characters with the status repaired, right or wrong.
         inserted: decoded characters inside the sending without a match.
@@ -106,10 +106,10 @@ class Transmission:
 
     @property
     def message_accuracy(self) -> float:
-        """1 - (wrong + inserted) / characters, 0 at least."""
+        """1 - wrong / characters, 0 at least."""
         if not self.found:
             return NOT_FOUND_MESSAGE_ACCURACY
-        return max(0.0, 1.0 - (self.wrong + self.inserted) / self.characters)
+        return max(0.0, 1.0 - self.wrong / self.characters)
 
     @property
     def bit_accuracy(self) -> float:
@@ -226,16 +226,17 @@ def _transmission(
             wrong_bits += (received.frame ^ frame.frame_of(sent)).bit_count()
         if received is None or received.code != sent:
             errors.append(CharacterError(k, round(sending.due_ns(k)), sent, received))
+    inserted = len(inside) - len(matches)
     return Transmission(
         start_ns=round(sending.start_ns),
         bit_rate_bps=frame.length * 1e9 / sending.period_ns,
         first=first,
         characters=stop - first,
-        wrong=len(errors),
+        wrong=len(errors) + inserted,
         missing=sum(error.received is None for error in errors),
         wrong_ok=sum(error.received is not None and error.received.status is Status.OK for error in errors),
         repaired=sum(character.status is Status.REPAIRED for _, character in matches.values()),
-        inserted=len(inside) - len(matches),
+        inserted=inserted,
         bits=(stop - first) * frame.length,
         wrong_bits=wrong_bits,
         errors=tuple(errors),
