@@ -92,7 +92,8 @@ def test_both_beacons_are_read_and_confirmed_and_the_lamp_is_not(at_once: tuple[
     for beacon in confirmed:
         truth = TEXT * 6 if beacon.bit_rate_bps == 3125.0 else TEXT
         text = text_of(outputs, beacon.track_id)
-        assert text == truth if beacon.bit_rate_bps == 504.0 else text.count('compare') >= 5
+        wrong = sum(a != b for a, b in zip(text, truth, strict=True))
+        assert wrong <= 0.03 * len(truth)
 
 
 @settings(max_examples=8, deadline=None)
