@@ -12,11 +12,12 @@ PACKAGE = Path(__file__).resolve().parents[1] / 'beacon_comm'
 ALLOWED_ROOMS = {
     'core': set(),
     'wire': {'core'},
+    'compiling': {'core', 'wire'},
     'simulation': {'core'},
     'recordings': {'core', 'wire', 'simulation'},
     'evaluation': {'core'},
-    'ros': {'core', 'wire'},
-    'cli': {'core', 'wire', 'simulation', 'recordings', 'evaluation'},
+    'ros': {'core', 'wire', 'compiling'},
+    'cli': {'core', 'wire', 'simulation', 'recordings', 'evaluation', 'compiling'},
 }
 ROS_MODULES = {
     'rclpy', 'rosidl_runtime_py', 'std_msgs', 'sensor_msgs', 'geometry_msgs', 'diagnostic_msgs', 'builtin_interfaces',

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from beacon_comm.compiling.warm_up import warm_up
 from beacon_comm.core.bearing import CameraModel
 from beacon_comm.core.events import NS_PER_S, EventBatch
 from beacon_comm.core.framing import CharacterFrame, transitions
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.ros.live import LiveReceiver, Step
 from beacon_comm.ros.report import Report
-from beacon_comm.ros.warm_up import warm_up
 from beacon_comm.wire.cdr import build_event_packet
 from beacon_comm.wire.evt3_encoder import Evt3Encoder
 
@@ -253,7 +253,7 @@ def test_a_cache_that_cannot_be_made_is_replaced(tmp_path: Path) -> None:
 def _cache_folder(cache: Path, temporary: Path) -> str:
     program = (
         'from pathlib import Path\n'
-        'import beacon_comm.ros.compiler_cache as cache\n'
+        'import beacon_comm.compiling.cache as cache\n'
         f'cache.PACKAGE = Path({str(cache)!r})\n'
         'print(cache.ensure_compiler_cache())\n'
     )

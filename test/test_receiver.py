@@ -16,7 +16,7 @@ from beacon_comm.recordings.disc import Disc
 from beacon_comm.simulation.led import sensor_noise, simulate_text, square_wave
 
 SIZE = (160, 120)
-TEXT = 'Shall I compare thee to a summer\'s day?'
+TEXT = "Shall I compare thee to a summer's day?"
 Events = tuple[np.ndarray, np.ndarray]
 CharacterList = list[tuple[int, int, int, int]]
 

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from beacon_comm.cli.parameter_arguments import add_parameter_arguments, parameters_from
+from beacon_comm.compiling.cache import ensure_compiler_cache
 from beacon_comm.core.errors import BeaconCommError, RecordingError
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.parameters import Parameters
@@ -66,8 +67,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    ensure_compiler_cache()
     # Imported here: the kernels' libraries take a second, and --help and wrong arguments need none of them.
-    from beacon_comm.cli.offline import Options, evaluate_recording, is_mat, warm_up
+    from beacon_comm.cli.offline import Options, evaluate_recording, is_mat
+    from beacon_comm.compiling.warm_up import warm_up
     from beacon_comm.core.bearing import CameraModel
 
     if arguments.start < 0.0 or (arguments.duration is not None and arguments.duration <= 0.0):
@@ -83,7 +86,7 @@ def _run(arguments: argparse.Namespace) -> int:
         arguments.start,
         arguments.duration,
     )
-    warm_up(parameters, bags=not all(map(is_mat, arguments.recordings)))
+    warm_up(parameters, pixels=not all(map(is_mat, arguments.recordings)))
     results: list[RecordingResult] = []
     code = EXIT_OK
     for recording in arguments.recordings:

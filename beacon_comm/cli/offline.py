@@ -20,7 +20,7 @@ from beacon_comm.cli.progress import progress
 from beacon_comm.core.bearing import CameraModel
 from beacon_comm.core.errors import RecordingError
 from beacon_comm.core.events import NS_PER_S, EventBatch
-from beacon_comm.core.framing import CharacterFrame, transitions
+from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.receiver import Receiver, SignalReceiver
 from beacon_comm.evaluation.held import Signal
@@ -29,8 +29,6 @@ from beacon_comm.evaluation.result import BeaconResult, RecordingResult
 from beacon_comm.evaluation.scoring import Transmission, not_found, score
 from beacon_comm.recordings.bags import open_recording
 from beacon_comm.recordings.mat import read_mat
-from beacon_comm.wire.cdr import build_event_packet
-from beacon_comm.wire.stream import ENCODINGS, PACKET_TYPES, EventStream
 
 SAMPLE_NS = 20_000_000
 MAT_BATCH_NS = 100_000_000
@@ -78,41 +76,6 @@ def evaluate_recording(path: str, options: Options) -> RecordingResult:
 def is_mat(path: str) -> bool:
     """Whether a recording is a MATLAB file, by its name."""
     return path.lower().endswith('.mat')
-
-
-def warm_up(parameters: Parameters, bags: bool) -> None:
-    """Compile the kernels on a made-up beacon, so that the first recording's speed is not the compiler's.
-
-    Args:
-        parameters: the receiver's.
-        bags: whether there are bags to come; a ``.mat`` file needs neither pixels nor packets.
-    """
-    bits = CharacterFrame.from_parameters(parameters).encode_bits('Warm up ' * 8)
-    edges_ns, levels = transitions(bits, max(parameters.bit_rates), NS_PER_S)
-    x, y = (grid.ravel().astype(np.uint16) for grid in np.meshgrid(np.arange(5, 10), np.arange(5, 10)))
-    batch = EventBatch(
-        np.tile(x, len(edges_ns)),
-        np.tile(y, len(edges_ns)),
-        np.repeat(np.where(levels > 0, 1, -1), len(x)).astype(np.int8),
-        np.repeat(edges_ns, len(x)),
-        int(edges_ns[-1]) + NS_PER_S // 10,
-    )
-    receivers = [SignalReceiver(parameters), Receiver(parameters, (16, 16))] if bags else [SignalReceiver(parameters)]
-    for receiver in receivers:
-        receiver.push(batch)
-        receiver.flush()
-    for encoding in ENCODINGS if bags else ():
-        packet = build_event_packet(
-            stamp_ns=0,
-            frame_id='',
-            width=16,
-            height=16,
-            seq=0,
-            time_base_ns=0,
-            encoding=encoding,
-            payload=bytes(64),
-        )
-        EventStream(PACKET_TYPES[0]).push(packet)
 
 
 def _evaluate_mat(path: str, options: Options) -> RecordingResult:

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
+from beacon_comm.compiling.cache import ensure_compiler_cache
 from beacon_comm.core.errors import BeaconCommError, ParameterError
 
 EVENT_TOPIC = '/event_camera/events'
@@ -45,6 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(own)
     try:
         _check(options)
+        ensure_compiler_cache()
         from beacon_comm.cli.replaying import replay  # slow to import: after the options, and Ctrl-C stays clean
 
         replay(options, ros)

@@ -7,8 +7,8 @@ construction with its name, value and range; nothing is repaired silently.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
 import math
+from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar
 
 from beacon_comm.core.errors import ParameterError
@@ -202,7 +202,7 @@ class Parameters(Declared):
     max_tracks: int = parameter(256, 'tracks kept at once; further blobs wait', '', 1, 65_000)
     routing_extent_factor: float = parameter(1.5, "an event is a track's within its extent times this …", '', 0.1)
     routing_margin_px: float = parameter(2.0, '… plus this', 'px', 0.0)
-    buffer_min_s: float = parameter(0.5, "events kept for each track: the longer of this …", 's', 0.0)
+    buffer_min_s: float = parameter(0.5, 'events kept for each track: the longer of this …', 's', 0.0)
     buffer_characters: int = parameter(30, '… and so many characters of the slowest listed rate', '', 1)
     buffer_max_bytes: int = parameter(16_000_000, 'bound of one buffer; overflow is counted', 'byte', 1000)
 

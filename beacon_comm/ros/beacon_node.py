@@ -24,6 +24,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo
 
+from beacon_comm.compiling.warm_up import warm_up
 from beacon_comm.core.errors import CalibrationError
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.receiver import BeaconSnapshot
@@ -38,7 +39,6 @@ from beacon_comm.ros.silence import Silence, Situation, why_silent
 from beacon_comm.ros.text import Texts
 from beacon_comm.ros.throttled_log import ThrottledLog
 from beacon_comm.ros.topic import Publishers, choose_type, find_publishers, is_supported, similar_topics, subscribe_raw
-from beacon_comm.ros.warm_up import warm_up
 
 NODE_NAME = 'beacon_node'
 GRAPH_PERIOD_S = 0.25

@@ -54,7 +54,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _run(args: Sequence[str] | None, stop: StopSignal) -> int:
-    from beacon_comm.ros.compiler_cache import ensure_compiler_cache
+    from beacon_comm.compiling.cache import ensure_compiler_cache
 
     ensure_compiler_cache()  # before anything imports numba
     import rclpy

@@ -13,7 +13,7 @@ import numpy as np
 from beacon_comm.core.events import NS_PER_S, EventBatch
 from beacon_comm.core.framing import CharacterFrame, transitions
 from beacon_comm.core.parameters import Parameters
-from beacon_comm.core.receiver import Receiver
+from beacon_comm.core.receiver import Receiver, SignalReceiver
 from beacon_comm.wire.cdr import build_event_packet
 from beacon_comm.wire.evt3_encoder import Evt3Encoder
 from beacon_comm.wire.stream import EventStream
@@ -42,9 +42,19 @@ def synthetic_beacon(parameters: Parameters, seconds: float = 0.6) -> EventBatch
     )
 
 
-def warm_up(parameters: Parameters) -> None:
-    """Push a synthetic beacon through the reader of every encoding and through a receiver of its own."""
+def warm_up(parameters: Parameters, pixels: bool = True) -> None:
+    """Push a synthetic beacon through the reader of every encoding and through a receiver of its own.
+
+    Args:
+        parameters: the receiver's.
+        pixels: False: for signals without pixels only, which need neither readers nor detection.
+    """
     events = synthetic_beacon(parameters)
+    if not pixels:
+        signal_receiver = SignalReceiver(parameters)
+        signal_receiver.push(events)
+        signal_receiver.flush()
+        return
     receiver = Receiver(parameters, (SIZE, SIZE))
     stream, encoder = EventStream(EVENT_PACKET), Evt3Encoder(SIZE, SIZE)
     cuts = np.linspace(0, len(events), PACKETS + 1).astype(int)
