@@ -1,1 +1,5 @@
-"""Command lines: argument parsing, printing and exit codes around the other rooms."""
+"""The command lines: thin, and the only room that may use all others."""
+
+from beacon_comm.compiling.cache import ensure_compiler_cache
+
+ensure_compiler_cache()  # before anything imports numba

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from beacon_comm.cli.evaluate import EXIT_ERROR, EXIT_OK, OneLineParser
+from beacon_comm.cli.parser import EXIT_ERROR, EXIT_OK, OneLineParser
 from beacon_comm.cli.waveform import frame_parts, save_waveform, terminal_waveform, visible
 from beacon_comm.core.errors import BeaconCommError, FramingError
 from beacon_comm.core.events import NS_PER_S

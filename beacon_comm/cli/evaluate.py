@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from typing import NoReturn
 
 from beacon_comm.cli.parameter_arguments import add_parameter_arguments, parameters_from
-from beacon_comm.compiling.cache import ensure_compiler_cache
+from beacon_comm.cli.parser import EXIT_ERROR, EXIT_OK, OneLineParser
 from beacon_comm.core.errors import BeaconCommError, RecordingError
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.parameters import Parameters
@@ -18,16 +17,7 @@ from beacon_comm.evaluation.result_json import write_json
 from beacon_comm.evaluation.truth import load_truth
 
 NAME = 'beacon_evaluate'
-EXIT_OK = 0
-EXIT_ERROR = 2
 
-
-class OneLineParser(argparse.ArgumentParser):
-    """Parser whose errors are one line."""
-
-    def error(self, message: str) -> NoReturn:
-        """Print the error without the usage, and exit with 2."""
-        self.exit(EXIT_ERROR, f'{self.prog}: {message}\n')
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -67,7 +57,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    ensure_compiler_cache()
     # Imported here: the kernels' libraries take a second, and --help and wrong arguments need none of them.
     from beacon_comm.cli.offline import Options, evaluate_recording, is_mat
     from beacon_comm.compiling.warm_up import warm_up

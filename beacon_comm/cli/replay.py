@@ -13,13 +13,11 @@ import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
 
-from beacon_comm.compiling.cache import ensure_compiler_cache
+from beacon_comm.cli.parser import EXIT_ERROR, OneLineParser
 from beacon_comm.core.errors import BeaconCommError, ParameterError
 
 EVENT_TOPIC = '/event_camera/events'
-EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
 
 _EPILOG = """\
@@ -35,18 +33,12 @@ exit codes: 0 done, 2 an error (one line says which), 130 Ctrl-C before the end 
 """
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        self.exit(EXIT_ERROR, f'{self.prog}: {message}\n')
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
     own, ros = _split_ros_arguments(sys.argv[1:] if arguments is None else arguments)
     options = _parser().parse_args(own)
     try:
         _check(options)
-        ensure_compiler_cache()
         from beacon_comm.cli.replaying import replay  # slow to import: after the options, and Ctrl-C stays clean
 
         replay(options, ros)
@@ -64,7 +56,7 @@ def _split_ros_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
+    parser = OneLineParser(
         prog='beacon_replay',
         description='Publish the events of a recording, or of several .mat recordings merged into one scene.',
         epilog=_EPILOG,
