@@ -19,7 +19,6 @@ from beacon_comm.evaluation.truth import load_truth
 NAME = 'beacon_evaluate'
 
 
-
 def make_parser() -> argparse.ArgumentParser:
     """Return the command line's parser."""
     parser = OneLineParser(

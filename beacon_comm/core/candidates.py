@@ -70,7 +70,8 @@ class _Slot:
     def judge(self, track_id: int, characters: list[Character]) -> list[ReceivedCharacter]:
         for character in characters:
             self.record.push(character)
-            self.read_to_ns = self.record.end_of(character)
+            end_ns = self.record.end_of(character)
+            self.read_to_ns = end_ns if self.read_to_ns is None else max(self.read_to_ns, end_ns)
         return [ReceivedCharacter(track_id, character) for character in characters]
 
 
