@@ -235,7 +235,7 @@ class Parameters(Declared):
         0.2, '… and whose median confidence is at least this …', '', 0.0, 1.0
     )
     confirm_sharp: float = parameter(
-        0.5, '… and at least this, or else …', '', 0.0, 1.0
+        0.4, '… and at least this, or else …', '', 0.0, 1.0
     )
     confirm_comb: float = parameter(
         0.9, '… no more than this share could be a lamp with missed edges: falls on one comb', '', 0.0, 1.0
