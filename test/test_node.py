@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import signal
-import subprocess
-import sys
 import time
-from collections import defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -20,8 +16,8 @@ messages = pytest.importorskip('beacon_comm.msg')
 EventPacket = pytest.importorskip('event_camera_msgs.msg').EventPacket
 
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
-from rclpy.executors import SingleThreadedExecutor  # noqa: E402
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
+from node_process import DOMAIN, START_TIMEOUT_S, NodeProcess, Peer  # noqa: E402
+from rclpy.qos import ReliabilityPolicy  # noqa: E402
 from sensor_msgs.msg import CameraInfo  # noqa: E402
 
 from beacon_comm.core.character import Status  # noqa: E402
@@ -30,9 +26,6 @@ from beacon_comm.core.framing import CharacterFrame, transitions  # noqa: E402
 from beacon_comm.wire.cdr import build_event_packet  # noqa: E402
 from beacon_comm.wire.evt3_encoder import Evt3Encoder  # noqa: E402
 
-DOMAIN = 1 + os.getpid() % 100
-START_TIMEOUT_S = 120  # the first start compiles
-TIMEOUT_S = 20
 STAMP_NS = 1_700_000_000 * NS_PER_S
 OFFSET_NS = STAMP_NS - NS_PER_S
 """ROS time less sensor time in what these tests publish."""
@@ -40,77 +33,6 @@ PACKET_NS = 5_000_000
 SIZE = (64, 48)
 BIT_RATE = 3125.0
 TEXT = "Shall I compare thee to a summer's day?\n"
-
-
-class NodeProcess:
-    """The node under test."""
-
-    def __init__(self, folder: Path, *arguments: str) -> None:
-        self.log = folder / f'node_{time.monotonic_ns()}.log'
-        environment = {
-            **os.environ, 'ROS_DOMAIN_ID': str(DOMAIN), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-            'ROS_LOG_DIR': str(folder), 'RCUTILS_COLORIZED_OUTPUT': '0',
-        }
-        with self.log.open('w') as log:
-            self.process = subprocess.Popen(
-                [sys.executable, '-m', 'beacon_comm.ros.node', '--ros-args', *arguments],
-                stdout=log, stderr=subprocess.STDOUT, env=environment, cwd=folder,
-            )
-
-    def output(self) -> str:
-        return self.log.read_text()
-
-    def wait_for(self, text: str, timeout_s: float = START_TIMEOUT_S) -> None:
-        deadline = time.monotonic() + timeout_s
-        while text not in self.output():
-            assert self.process.poll() is None, self.output()
-            assert time.monotonic() < deadline, f'no {text!r} in:\n{self.output()}'
-            time.sleep(0.02)
-
-    def exit_code(self, timeout_s: float = TIMEOUT_S) -> int:
-        return self.process.wait(timeout_s)
-
-    def kill(self) -> None:
-        if self.process.poll() is None:
-            self.process.kill()
-            self.process.wait()
-
-
-class Peer:
-    """The other end: a driver and a listener in the test's own process."""
-
-    def __init__(self, name: str) -> None:
-        self.context = rclpy.Context()
-        self.context.init(domain_id=DOMAIN)
-        self.node = rclpy.create_node(name, context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
-        self.heard: dict[str, list[Any]] = defaultdict(list)
-        self.publisher: Any = None
-
-    def listen(self, topic: str, kind: Any, latched: bool = False) -> None:
-        durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
-        qos = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
-        self.node.create_subscription(kind, topic, self.heard[topic].append, qos)
-
-    def advertise(self, kind: Any, topic: str, reliability: ReliabilityPolicy) -> None:
-        self.publisher = self.node.create_publisher(kind, topic, QoSProfile(depth=1000, reliability=reliability))
-
-    def spin_until(self, condition: Callable[[], object], timeout_s: float = TIMEOUT_S) -> bool:
-        deadline = time.monotonic() + timeout_s
-        while not condition():
-            if time.monotonic() > deadline:
-                return False
-            self.executor.spin_once(timeout_sec=0.02)
-        return True
-
-    def spin_for(self, seconds: float) -> None:
-        self.spin_until(lambda: False, seconds)
-
-    def close(self) -> None:
-        self.executor.shutdown()
-        self.node.destroy_node()
-        self.context.try_shutdown()
 
 
 def beacon_events(text: str, start_ns: int, x_px: int, y_px: int) -> EventBatch:
