@@ -35,10 +35,10 @@ class Decoded(NamedTuple):
     paths: dict[int, list[tuple[int, float, float]]]
     confirmed: tuple[int, ...]
 
-    def near(self, disc: Disc) -> int:
-        """Return the one confirmed track on a disc's path."""
+    def near(self, beacon: Beacon) -> int:
+        """Return the one confirmed track on a beacon's path."""
 
-        (found,) = [track_id for track_id in self.confirmed if rms_px(self.paths[track_id], disc) < 3.0]
+        (found,) = [track_id for track_id in self.confirmed if rms_px(self.paths[track_id], beacon) < 3.0]
         return found
 
 
@@ -76,9 +76,10 @@ def read(decoded: Decoded, track_id: int) -> list[tuple[int, int]]:
     return [(code, status) for _, code, status in decoded.characters[track_id]]
 
 
-def rms_px(path: list[tuple[int, float, float]], disc: Disc) -> float:
-    t_ns, x, y = np.array(path).T
-    centre_x, centre_y = disc.centre(t_ns / NS_PER_S)
+def rms_px(path: list[tuple[int, float, float]], beacon: Beacon) -> float:
+    """Return the distance from the beacon's true path while it was sending (px, rms)."""
+    t_ns, x, y = np.array([point for point in path if point[0] <= beacon.end_ns]).T
+    centre_x, centre_y = beacon.disc.centre(t_ns / NS_PER_S)
     return float(np.sqrt(np.mean((x - centre_x) ** 2 + (y - centre_y) ** 2)))
 
 
@@ -96,11 +97,11 @@ def test_a_real_background_does_not_matter(name: str, share_that_may_differ: flo
     without = decode(Scene(both, width, height).batches(), width, height)
     assert len(with_background.confirmed) == len(without.confirmed) == 2
     for beacon in both:
-        track, alone = with_background.near(beacon.disc), without.near(beacon.disc)
+        track, alone = with_background.near(beacon), without.near(beacon)
         there, here = read(with_background, track), read(without, alone)
         differing = sum(a != b for a, b in zip(there, here, strict=False)) + abs(len(there) - len(here))
         assert differing <= share_that_may_differ * len(here)
-        assert rms_px(with_background.paths[track], beacon.disc) < 0.3
+        assert rms_px(with_background.paths[track], beacon) < 0.3
 
 
 @pytest.mark.parametrize(
@@ -237,9 +238,9 @@ def test_live_and_offline_agree_over_a_real_background(data_folder: Path, tmp_pa
     camera = CameraModel.from_yaml(CALIBRATION)
     assert len(decoded.confirmed) == len(offline.confirmed) == 2
     for beacon in both:
-        track = decoded.near(beacon.disc)
-        assert decoded.characters[track] == offline.characters[offline.near(beacon.disc)]
-        assert rms_px(decoded.paths[track], beacon.disc) < 0.3
+        track = decoded.near(beacon)
+        assert decoded.characters[track] == offline.characters[offline.near(beacon)]
+        assert rms_px(decoded.paths[track], beacon) < 0.3
         seen = [b for message in bearings for b in message.bearings if b.track_id == track and b.has_bearing]
         assert len(seen) > 50
         vectors = np.array([(b.bearing.x, b.bearing.y, b.bearing.z) for b in seen])
