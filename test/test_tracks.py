@@ -11,6 +11,7 @@ from beacon_comm.core.tracks import Track, Tracker
 
 HOP_NS = 10_000_000
 T0_NS = 1 << 40
+SIZE = (640, 480)
 
 
 def blob(x, y, t_ns, index=2.0, extent=4.0, fresh=True, events=1000):
@@ -33,7 +34,7 @@ def silence(tracker, start, hops):
 
 
 def test_one_label_for_one_moving_blob():
-    tracker = Tracker(Parameters())
+    tracker = Tracker(Parameters(), SIZE)
     changes = follow(tracker, lambda s: (10 + 300 * s, 20 - 40 * s), 100)
     assert [len(c.new) for c in changes] == [1] + [0] * 99
     (track,) = tracker.tracks.values()
@@ -44,7 +45,7 @@ def test_one_label_for_one_moving_blob():
 
 
 def test_a_blob_that_turns_back_at_the_border_keeps_its_label():
-    tracker = Tracker(Parameters())
+    tracker = Tracker(Parameters(), SIZE)
     follow(tracker, lambda s: (abs(200 - 400 * s), 50), 100)
     assert list(tracker.tracks) == [1]
     assert tracker.tracks[1].position_at(T0_NS + 990_000_000)[0] == pytest.approx(196, abs=0.5)
@@ -52,7 +53,7 @@ def test_a_blob_that_turns_back_at_the_border_keeps_its_label():
 
 def test_a_still_blob_stays_in_silence():
     rng = np.random.default_rng(0)
-    tracker = Tracker(Parameters())
+    tracker = Tracker(Parameters(), SIZE)
     follow(tracker, lambda s: (50 + rng.normal(0, 0.2), 50 + rng.normal(0, 0.2)), 50)
     silence(tracker, 50, 150)
     (track,) = tracker.tracks.values()
@@ -61,7 +62,7 @@ def test_a_still_blob_stays_in_silence():
 
 
 def test_a_moving_blob_goes_on_in_silence_but_not_without_bounds():
-    tracker = Tracker(Parameters())
+    tracker = Tracker(Parameters(), SIZE)
     follow(tracker, lambda s: (500 * s, 50), 50)
     (track,) = tracker.tracks.values()
     assert track.position_at(T0_NS + 500_000_000)[0] == pytest.approx(250, abs=1)
@@ -71,7 +72,7 @@ def test_a_moving_blob_goes_on_in_silence_but_not_without_bounds():
 
 
 def test_quiet_then_back_is_the_same_track():
-    tracker = Tracker(Parameters())
+    tracker = Tracker(Parameters(), SIZE)
     follow(tracker, lambda s: (50 + 20 * s, 50), 50)
     changes = silence(tracker, 50, 150)
     assert tracker.tracks[1].quiet and not any(c.lost for c in changes)
@@ -79,8 +80,17 @@ def test_quiet_then_back_is_the_same_track():
     assert list(tracker.tracks) == [1] and not tracker.tracks[1].quiet
 
 
+def test_a_blob_that_leaves_waits_at_the_border():
+    tracker = Tracker(Parameters(), SIZE)
+    follow(tracker, lambda s: (400 + 1000 * s, 100 - 20 * s), 23)
+    silence(tracker, 23, 100)
+    (track,) = tracker.tracks.values()
+    x, y = track.position_at(T0_NS + 123 * HOP_NS)
+    assert track.quiet and x == SIZE[0] - 1 and y == pytest.approx(95, abs=2)
+
+
 def test_quiet_for_too_long_is_lost_and_comes_back_under_another_label():
-    tracker = Tracker(Parameters(lost_after_s=2.0))
+    tracker = Tracker(Parameters(lost_after_s=2.0), SIZE)
     follow(tracker, lambda s: (50, 50), 50)
     changes = silence(tracker, 50, 210)
     lost = [(k, track.track_id) for k, c in enumerate(changes) for track in c.lost]
@@ -92,7 +102,7 @@ def test_quiet_for_too_long_is_lost_and_comes_back_under_another_label():
 def test_the_gate_grows_within_bounds():
     parameters = Parameters(association_gate_px=12.0, gate_growth_px_per_s=40.0, max_gate_px=40.0)
     for silent_hops, distance, same in ((1, 11, True), (1, 14, False), (50, 30, True), (150, 38, True), (150, 42, False)):
-        tracker = Tracker(parameters)
+        tracker = Tracker(parameters, SIZE)
         follow(tracker, lambda s: (100, 100), 30)
         silence(tracker, 30, silent_hops)
         follow(tracker, lambda s, d=distance: (100 + d, 100), 1, start=30 + silent_hops)
@@ -101,14 +111,14 @@ def test_the_gate_grows_within_bounds():
 
 def test_nearest_pairs_first():
     """Both tracks are in reach of both blobs; the globally nearest pair decides."""
-    tracker = Tracker(Parameters())
+    tracker = Tracker(Parameters(), SIZE)
     tracker.update([blob(50, 50, T0_NS, index=3.0), blob(60, 50, T0_NS, index=2.0)], T0_NS)
     tracker.update([blob(51, 50, T0_NS + HOP_NS), blob(61, 50, T0_NS + HOP_NS)][::-1], T0_NS + HOP_NS)
     assert [round(track.x_px) for track in tracker.tracks.values()] == [51, 61]
 
 
 def test_two_blobs_never_share_a_track_nor_two_tracks_a_blob():
-    tracker = Tracker(Parameters())
+    tracker = Tracker(Parameters(), SIZE)
     for k in range(100):
         t_ns = T0_NS + k * HOP_NS
         changes = tracker.update([blob(50, 50, t_ns), blob(62, 50, t_ns, index=1.0)], t_ns)
@@ -117,7 +127,7 @@ def test_two_blobs_never_share_a_track_nor_two_tracks_a_blob():
 
 
 def test_of_merging_tracks_the_older_goes_on():
-    tracker = Tracker(Parameters(merge_after_s=0.5))
+    tracker = Tracker(Parameters(merge_after_s=0.5), SIZE)
     follow(tracker, lambda s: (40, 50), 10)
     lost = []
     for k in range(10, 140):
@@ -133,7 +143,7 @@ def test_of_merging_tracks_the_older_goes_on():
 
 
 def test_two_beacons_that_touch_for_a_moment_keep_their_labels():
-    tracker = Tracker(Parameters(merge_after_s=0.5))
+    tracker = Tracker(Parameters(merge_after_s=0.5), SIZE)
     for k in range(60):
         t_ns = T0_NS + k * HOP_NS
         apart = [blob(50, 50, t_ns), blob(62, 50, t_ns)]
@@ -143,7 +153,7 @@ def test_two_beacons_that_touch_for_a_moment_keep_their_labels():
 
 
 def test_pieces_of_a_followed_blob_begin_no_tracks():
-    tracker = Tracker(Parameters())
+    tracker = Tracker(Parameters(), SIZE)
     for k in range(100):
         t_ns = T0_NS + k * HOP_NS
         whole = [blob(50, 50, t_ns, extent=15.0)]
@@ -153,7 +163,7 @@ def test_pieces_of_a_followed_blob_begin_no_tracks():
 
 
 def test_the_strongest_get_the_tracks_and_the_others_wait():
-    tracker = Tracker(Parameters(max_tracks=3))
+    tracker = Tracker(Parameters(max_tracks=3), SIZE)
     seen = [blob(50 * k, 50, T0_NS, index=1.0 + k % 4, events=100 + k) for k in range(8)]
     changes = tracker.update(seen, T0_NS)
     assert changes.waiting == 5
@@ -162,7 +172,7 @@ def test_the_strongest_get_the_tracks_and_the_others_wait():
 
 
 def test_a_blob_without_new_events_is_seen_but_does_not_move_its_track():
-    tracker = Tracker(Parameters(lost_after_s=0.5))
+    tracker = Tracker(Parameters(lost_after_s=0.5), SIZE)
     follow(tracker, lambda s: (50, 50), 10)
     follow(tracker, lambda s: (55, 50), 20, start=10, fresh=False)
     track = tracker.tracks[1]
@@ -171,9 +181,9 @@ def test_a_blob_without_new_events_is_seen_but_does_not_move_its_track():
 
 
 def test_labels_go_on_after_clearing():
-    tracker = Tracker(Parameters())
+    tracker = Tracker(Parameters(), SIZE)
     follow(tracker, lambda s: (50, 50), 3)
-    assert [track.track_id for track in tracker.clear().lost] == [1]
+    assert [track.track_id for track in tracker.clear(SIZE).lost] == [1]
     follow(tracker, lambda s: (50, 50), 1)
     assert list(tracker.tracks) == [2]
 
@@ -182,7 +192,7 @@ def test_labels_go_on_after_clearing():
 @given(st.lists(st.lists(st.tuples(st.integers(0, 100), st.integers(0, 100)), max_size=8), max_size=60))
 def test_any_blobs(frames):
     """Labels only ever rise, and the tracks are the new ones less the lost ones."""
-    tracker = Tracker(Parameters(max_tracks=6, lost_after_s=0.1, merge_after_s=0.05))
+    tracker = Tracker(Parameters(max_tracks=6, lost_after_s=0.1, merge_after_s=0.05), SIZE)
     alive: set[int] = set()
     last = 0
     for k, frame in enumerate(frames):

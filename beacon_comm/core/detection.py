@@ -66,7 +66,7 @@ class Detector:
         self._parameters = parameters
         self._hop_ns = hop_length_ns(parameters)
         self._buffer_ns = buffer_length_ns(parameters)
-        self._tracker = Tracker(parameters)
+        self._tracker = Tracker(parameters, sensor_size)
         self._buffers: dict[int, EventBuffer] = {}
         self._stats = DetectionStats()
         self._outside_before = self._overflow_before = 0
@@ -149,7 +149,7 @@ class Detector:
         """Go on with another sensor size ``(width, height)`` (px): all tracks are lost, labels go on."""
         self._outside_before += self._router.outside_events
         self._overflow_before += self._images.overflow_events
-        changes = TrackChanges(lost=self._early.lost + self._tracker.clear().lost)
+        changes = TrackChanges(lost=self._early.lost + self._tracker.clear(sensor_size).lost)
         self._stats.lost_tracks += len(changes.lost) - len(self._early.lost)
         self._buffers.clear()
         self._start(sensor_size)

@@ -125,10 +125,12 @@ class Tracker:
 
     Args:
         parameters: those under "Tracks".
+        sensor_size: width and height (px); a prediction ends at the sensor's border.
     """
 
-    def __init__(self, parameters: Parameters) -> None:
+    def __init__(self, parameters: Parameters, sensor_size: tuple[int, int]) -> None:
         self._parameters = parameters
+        self._sensor_size = sensor_size
         self._lost_after_ns = round(parameters.lost_after_s * NS_PER_S)
         self._merge_after_ns = round(parameters.merge_after_s * NS_PER_S)
         self._tracks: dict[int, Track] = {}
@@ -152,14 +154,16 @@ class Tracker:
                 _take(track, blobs[blob_of[i]], t_hop_ns)
             else:
                 _miss(track, covering[i] >= 0, t_hop_ns)
+                self._keep_on_sensor(track, t_hop_ns)
         lost = tuple(track for track in tracks if self._ended(track, t_hop_ns))
         for track in lost:
             del self._tracks[track.track_id]
         new, new_blobs, waiting = self._begin(tracks, blobs, blob_of, track_of, t_hop_ns)
         return TrackChanges(new, lost, new_blobs, waiting)
 
-    def clear(self) -> TrackChanges:
-        """Lose every track; labels go on."""
+    def clear(self, sensor_size: tuple[int, int]) -> TrackChanges:
+        """Lose every track and go on with a sensor size; labels go on."""
+        self._sensor_size = sensor_size
         lost = tuple(self._tracks.values())
         self._tracks.clear()
         return TrackChanges(lost=lost)
@@ -185,6 +189,15 @@ class Tracker:
             if blob_of[i] < 0 and track_of[j] < 0:
                 blob_of[i], track_of[j] = j, i
         return blob_of, track_of
+
+    def _keep_on_sensor(self, track: Track, t_hop_ns: int) -> None:
+        """Let an unseen track wait at the border where it left: it cannot be seen beyond."""
+        x, y = track.position_at(t_hop_ns)
+        kept = min(max(x, 0.0), self._sensor_size[0] - 1.0), min(max(y, 0.0), self._sensor_size[1] - 1.0)
+        if kept != (x, y):
+            track.x_px, track.y_px = kept
+            track.t_ns = t_hop_ns
+            track.vx_px_per_s = track.vy_px_per_s = 0.0
 
     def _ended(self, track: Track, t_hop_ns: int) -> bool:
         if track.quiet and t_hop_ns - track.last_seen_ns >= self._lost_after_ns:
