@@ -45,6 +45,12 @@ def test_the_yaml_file_holds_the_defaults() -> None:
     )
 
 
+def test_the_page_of_parameters_is_up_to_date() -> None:
+    assert (PROJECT / 'docs' / 'parameters.md').read_text() == markdown_text(), (
+        'run: python -m beacon_comm.ros.parameters --markdown > docs/parameters.md'
+    )
+
+
 def test_the_yaml_file_reads_back_to_the_defaults() -> None:
     values = yaml.safe_load(yaml_text())['/**']['ros__parameters']
     assert list(values) == [declaration.name for declaration in all_declarations()]

@@ -148,8 +148,15 @@ def yaml_text() -> str:
 
 
 def markdown_text() -> str:
-    """Return the README's table of parameters."""
-    lines = ['| Parameter | Default | Range | Meaning |', '|---|---|---|---|']
+    """Return the text of ``docs/parameters.md``."""
+    lines = [
+        '# Parameters of beacon_node',
+        '',
+        'Written by `python -m beacon_comm.ros.parameters --markdown`; a test holds it to the declarations.',
+        '',
+        '| Parameter | Default | Range | Meaning |',
+        '|---|---|---|---|',
+    ]
     for declaration in all_declarations():
         default = declaration.default
         shown = f'{default:.6g}' if isinstance(default, float) else _yaml_value(default)
@@ -160,9 +167,9 @@ def markdown_text() -> str:
 
 
 def main() -> None:
-    """Print the YAML file or the README's table."""
+    """Print the YAML file or the page of parameters."""
     parser = argparse.ArgumentParser(description='Print config/beacon.yaml, or the table of parameters.')
-    parser.add_argument('--markdown', action='store_true', help="print the README's table instead")
+    parser.add_argument('--markdown', action='store_true', help='print docs/parameters.md instead')
     print(markdown_text() if parser.parse_args().markdown else yaml_text(), end='')
 
 
