@@ -238,7 +238,7 @@ class Parameters(Declared):
         0.4, '… and at least this, or else …', '', 0.0, 1.0
     )
     confirm_comb: float = parameter(
-        0.9, '… no more than this share could be a lamp with missed edges: falls on one comb', '', 0.0, 1.0
+        0.8, '… no more than this share could be a lamp with missed edges: falls on one comb', '', 0.0, 1.0
     )
     allow_periodic: bool = parameter(False, 'confirm streams that repeat, fall regularly or on a comb, too')
 
