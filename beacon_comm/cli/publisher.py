@@ -150,8 +150,8 @@ def _message_class(message_type: str) -> type:
         return message_class
     package = names[-1].split('/')[0]
     raise PublishError(
-        f'publishing {message_type} needs the Python package {package} (on Ubuntu: apt install'
-        f' ros-jazzy-{package.replace("_", "-")}); --write OUT does without'
+        f'publishing {message_type} needs the ROS package {package} (its Python messages);'
+        ' --write OUT does without'
     )
 
 
