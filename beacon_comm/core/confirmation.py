@@ -71,8 +71,6 @@ class ParityRecord:
                vary as a text's (CONFIRMED), unless the same character rejects it
     confirmed  ``judged_characters`` in a row, at each of which < ``judged_right`` of the     demoted
                last ``judged_last`` parities were right (DEMOTED)
-    confirmed  not one counted character within ``starved_after_ns`` of time with events      demoted
-               (STARVED)
     demoted    never: a track that is tried again gets a new record                           --
     ========== ============================================================================== =========
 
@@ -103,6 +101,7 @@ class ParityRecord:
         self._window: deque[_Counted] = deque(maxlen=parameters.confirm_window)
         self._last_start_ns: int | None = None
         self._failures = 0  # characters in a row at which the last parities failed a confirmed beacon
+        self._doubtful_at: int | None = None  # number of the character at which a window first passed in doubt
         self._hungry_ns = 0
         self._known_ns: int | None = None
 
@@ -124,7 +123,6 @@ class ParityRecord:
                 return Verdict.REJECTED
         if self._vouched_for():
             self.confirmed = True
-            self._hungry_ns = 0
             self.confirmed_at_ns = self.end_of(character)
             return Verdict.CONFIRMED
         return Verdict.NONE
@@ -139,9 +137,8 @@ class ParityRecord:
         if self._known_ns is not None and not quiet:
             self._hungry_ns += max(0, t_ns - self._known_ns)
         self._known_ns = t_ns
-        if self.demoted or self._hungry_ns < self.starved_after_ns:
-            return Verdict.NONE
-        self.confirmed = False
+        if self.confirmed or self.demoted or self._hungry_ns < self.starved_after_ns:
+            return Verdict.NONE  # a confirmed beacon may hold its LED on for as long as it likes
         self.demoted = True
         return Verdict.STARVED
 
@@ -174,7 +171,6 @@ class ParityRecord:
         return sum(self._rights) < self._p.judged_right
 
     def _judge_beacon(self) -> Verdict:
-        self._hungry_ns = 0
         self._failures = self._failures + 1 if self._failing else 0
         if self._failures < self._p.judged_characters:
             return Verdict.NONE
@@ -195,6 +191,11 @@ class ParityRecord:
         return p.allow_periodic or not self._could_be_a_lamp(vouching, confidence)
 
     def _could_be_a_lamp(self, vouching: Sequence[_Counted], confidence: float) -> bool:
+        """Tell whether a window that passes otherwise may be light that only repeats.
+
+        One that lies on a comb is a lamp's where it is blurred; where it is not quite sharp, one such window may be a
+        lamp's by chance, and another one is asked for that has no character in common with it.
+        """
         p = self._p
         codes = [counted.code if counted.vouches else None for counted in self._window]
         if any(repeats(codes, period, p.confirm_repeats) for period in range(1, p.confirm_period + 1)):
@@ -202,7 +203,13 @@ class ParityRecord:
         frames = [counted.frame for counted in vouching]
         if regular_share(frames, self._layout.length) > p.confirm_regular:
             return True
-        return confidence < p.confirm_sharp and comb_share(frames, self._layout.length) > p.confirm_comb
+        if confidence >= p.confirm_sure or comb_share(frames, self._layout.length) <= p.confirm_comb:
+            return False
+        if confidence < p.confirm_sharp:
+            return True
+        if self._doubtful_at is None:
+            self._doubtful_at = self.characters
+        return self.characters < self._doubtful_at + p.confirm_window
 
 
 def repeats(codes: Sequence[int | None], period: int, share: float) -> bool:

@@ -226,7 +226,7 @@ class Parameters(Declared):
     confirm_distinct_codes: int = parameter(4, '… with so many distinct codes …', '', 1)
     confirm_period: int = parameter(3, '… that do not repeat with a period of so many characters or less', '', 0)
     confirm_repeats: float = parameter(
-        0.34, '… (repeats: more than this share of the ok characters equals the one a period before)', '', 0.0, 1.0
+        0.5, '… (repeats: more than this share of the ok characters equals the one a period before)', '', 0.0, 1.0
     )
     confirm_regular: float = parameter(
         0.66, '… and of which no more than this share could be a lamp: falls at one constant spacing', '', 0.0, 1.0
@@ -239,6 +239,9 @@ class Parameters(Declared):
     )
     confirm_comb: float = parameter(
         0.8, '… no more than this share could be a lamp with missed edges: falls on one comb', '', 0.0, 1.0
+    )
+    confirm_sure: float = parameter(
+        0.6, '… between the two: two such windows without a common character are asked for below this', '', 0.0, 1.0
     )
     allow_periodic: bool = parameter(False, 'confirm streams that repeat, fall regularly or on a comb, too')
 

@@ -80,7 +80,8 @@ class Output:
     """What one push gave.
 
     Attributes:
-        characters: decoded characters, in order of decision.
+        characters: decoded characters, those of each track in order of time; the order between tracks depends on
+            the batches.
         lost: last snapshots of the tracks that were lost.
         confirmed_changed: the set of confirmed beacons is another one than before.
     """

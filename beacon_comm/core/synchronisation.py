@@ -16,7 +16,7 @@ Added to the paper's rules:
 * *Idle* (``idle_start``): a legal line is high for 10 bits at most (7 data bits, parity, 2 stop bits), so the first
   fall after 10.5 or more high bits is a start bit: bridging stops, the search starts anew.  Without the rule a line
   has to be high for three characters until the search starts anew.
-* *Break*: a legal line is low for 9 bits at most; 12 or more low bits are a break, and no character that reaches
+* *Break*: a legal line is low for 9 bits at most; 12 or more low bits (as read: 11.5) are a break, and no character that reaches
   into it is given out.
 * *Silence decodes as nothing*: a character is given out if its start edge was seen, or if it was bridged between two
   seen edges two frames apart.
@@ -38,8 +38,8 @@ from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.high_pass import Edges
 
-BREAK_BITS_OVER_LENGTH = 1.0
-"""A break is so many bits longer than a character: 12 bits."""
+BREAK_BITS_OVER_LENGTH = 0.5
+"""A break is so many bits longer than a character: of 12 bits, less half a bit, since its edges come late or early."""
 
 IDLE_BITS_OVER_LENGTH = -0.5
 """An idle line is high for so many bits more than a character has: 10.5 bits."""

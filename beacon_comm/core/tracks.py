@@ -30,6 +30,7 @@ _STEADY_S = 0.1  # a prediction goes on unchanged for this long …
 _FADE_S = 1.0  # … and then fades with this time constant
 _ACCELERATION = 400.0  # white acceleration of the filter (px²/s³): 2 px/s more uncertain after 10 ms
 _FIRST_SPEED_PX_PER_S = 200.0  # standard deviation of an unknown velocity
+_KNOWN_AFTER_NS = 100_000_000  # a velocity seen for less long is not gone on with
 _FLOOR_PX = 0.05  # an observation is never better than this
 _SURPRISE = 16.0  # an innovation of more than 4 standard deviations is a manoeuvre
 _EXTENT_RISE, _EXTENT_FALL = 0.5, 0.05  # an extent grows at once and shrinks slowly
@@ -97,7 +98,8 @@ class Track:
     def fall_quiet(self) -> None:
         """Go on by prediction; of the velocity only what is certain is kept, so that a still blob stays."""
         speed2 = self.vx_px_per_s**2 + self.vy_px_per_s**2
-        kept = max(0.0, 1.0 - 8.0 * self.variance[2] / speed2) if speed2 > 0 else 0.0
+        known = speed2 > 0 and self.last_seen_ns - self.first_seen_ns >= _KNOWN_AFTER_NS
+        kept = max(0.0, 1.0 - 8.0 * self.variance[2] / speed2) if known else 0.0
         self.vx_px_per_s *= kept
         self.vy_px_per_s *= kept
         self.quiet = True
