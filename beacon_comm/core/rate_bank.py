@@ -114,10 +114,19 @@ class _Rate:
         contradicting = covered_ns(overlapping, start_ns, stop_ns) - explained
         return explained - CONTRADICTION_WEIGHT * contradicting
 
-    def merit_since(self, start_ns: int) -> tuple[int, int]:
-        """Return the time explained from ``start_ns`` on (ns); for rates alike in that, the number of characters."""
+    def merit_since(self, start_ns: int) -> tuple[float, int]:
+        """Return the time explained from ``start_ns`` on (ns); for rates alike in that, the number of characters.
+
+        Each ok character explains as much of its time as it is confident: long frames that a slow rate reads out of
+        a fast signal by chance have edges in the middles of their bits.
+        """
         fresh = [reading for reading in self.held if reading.span.start_ns >= start_ns]
-        return explained_ns(fresh, start_ns, fresh[-1].span.stop_ns) if fresh else 0, len(fresh)
+        explained = sum(
+            (reading.span.stop_ns - reading.span.start_ns) * reading.character.confidence
+            for reading in fresh
+            if reading.character.status == Status.OK
+        )
+        return explained, len(fresh)
 
 
 class RateBank:
