@@ -257,6 +257,28 @@ def check_another_driver_is_read(peer: Peer, track_id: int, stream: list[bytes])
     assert min(character.track_id for character in characters(peer)[before:]) > track_id
 
 
+def test_reasons_of_every_severity_are_logged_and_the_node_goes_on(
+    peer: Peer, start: Callable[..., NodeProcess]
+) -> None:
+    """A warning (no publisher), then an information (nothing above the threshold)."""
+    node = start('-r', 'events:=/camera/events', '-p', 'index_threshold:=50.0', '-p', 'bit_rates:=[3125]')
+    node.wait_for('no publisher on /camera/events')
+    peer.advertise(EventPacket, '/camera/events', ReliabilityPolicy.BEST_EFFORT)
+    assert peer.spin_until(peer.publisher.get_subscription_count), node.output()
+
+    def informed() -> bool:
+        log = node.output().rsplit('reading /camera/events', 1)[-1]
+        return '[INFO]' in log and 'index' in log
+
+    for message in packets(beacon_events(60 * TEXT, NS_PER_S, 42, 24)):
+        publish(peer, [message])
+        if informed():
+            break
+    assert informed() and node.process.poll() is None, node.output()
+    node.process.send_signal(signal.SIGINT)
+    assert node.exit_code() == 0, node.output()
+
+
 def test_silence_is_explained_and_a_calibration_gives_bearings(
     peer: Peer, start: Callable[..., NodeProcess]
 ) -> None:

@@ -16,8 +16,8 @@ Added to the paper's rules:
 * *Idle* (``idle_start``): a legal line is high for 10 bits at most (7 data bits, parity, 2 stop bits), so the first
   fall after 10.5 or more high bits is a start bit: bridging stops, the search starts anew.  Without the rule a line
   has to be high for three characters until the search starts anew.
-* *Break*: a legal line is low for 9 bits at most; 12 or more low bits (as read: 11.5) are a break, and no character that reaches
-  into it is given out.
+* *Break*: a legal line is low for 9 bits at most; 12 or more low bits (11.5 as read) are a break, and no character
+  that reaches into it is given out.
 * *Silence decodes as nothing*: a character is given out if its start edge was seen, or if it was bridged between two
   seen edges two frames apart.
 * *Trials*: the paper starts at the first falling edge it meets and slips left until it sits on a start bit, which

@@ -12,6 +12,7 @@ from __future__ import annotations
 import time
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from functools import wraps
 from typing import Any
 
@@ -57,7 +58,8 @@ def guarded(callback: Callable[..., None]) -> Callable[..., None]:
             callback(self, *args)
         except Exception:
             self.report.totals['internal_errors'] += 1
-            self.log_error('internal', f'in {callback.__name__}: {traceback.format_exc()}', time.monotonic_ns())
+            with suppress(Exception):
+                self.log_error('internal', f'in {callback.__name__}: {traceback.format_exc()}', time.monotonic_ns())
 
     return run
 
@@ -83,10 +85,12 @@ class BeaconNode(Node):
         for line in unknown_parameters(list(self._parameter_overrides)):
             self.get_logger().warning(line)
         self.report = Report()
-        self.log_error = ThrottledLog(self.get_logger().error, LOG_PERIOD_NS)
-        self.log_warning = ThrottledLog(self.get_logger().warning, LOG_PERIOD_NS)
-        self._log_silence = ThrottledLog(self.get_logger().warning, SILENCE_LOG_PERIOD_NS, counting=False)
-        self._log_quiet = ThrottledLog(self.get_logger().info, SILENCE_LOG_PERIOD_NS, counting=False)
+        # rclpy allows one severity for each place in the source that logs, so every log is a place of its own.
+        logger = self.get_logger()
+        self.log_error = ThrottledLog(lambda text: logger.error(text), LOG_PERIOD_NS)
+        self.log_warning = ThrottledLog(lambda text: logger.warning(text), LOG_PERIOD_NS)
+        self._log_silence = ThrottledLog(lambda text: logger.warning(text), SILENCE_LOG_PERIOD_NS, counting=False)
+        self._log_quiet = ThrottledLog(lambda text: logger.info(text), SILENCE_LOG_PERIOD_NS, counting=False)
         camera = load_camera(self._own.camera_info_file)
         if camera is None and not self._own.use_camera_info:
             self.get_logger().info('no calibration: bearings are pixels only (camera_info_file, use_camera_info)')
@@ -268,7 +272,7 @@ class BeaconNode(Node):
             index_threshold=self._core.index_threshold,
         )
         silence = why_silent(situation)
-        if silence is not None and silence == self._silence:
+        if silence is not None and self._silence is not None and silence.cause is self._silence.cause:
             log = self._log_silence if silence.cause.is_fault else self._log_quiet
             log(silence.cause.name, silence.text, time.monotonic_ns())
         self._silence = silence
