@@ -3,6 +3,7 @@
 import io
 import json
 import re
+import signal
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beacon_comm.cli.encode import main
+from beacon_comm.cli.interrupts import interrupts_held
 from beacon_comm.cli.waveform import terminal_waveform
 from beacon_comm.core.framing import CharacterFrame
 
@@ -71,7 +73,7 @@ def test_the_frames_options(capsys) -> None:
         (('',), 'no text'),
         (('S', '--parity', 'mark'), 'parity'),
         (('S', '--data-bits', '9'), 'data_bits'),
-        (('S', '--bit-rate', '5'), 'bit_rates'),
+        (('S', '--bit-rate', '0'), r'^beacon_encode: --bit-rate 0\.0: must lie in \[20, 10000\]'),
         (('S', '--bit-rate', 'fast'), '--bit-rate'),
         (('S', '--plot', '/absent/folder/w.png'), r'/absent/folder/w\.png: cannot be written'),
         (('S', '--plot', 'w.sound'), r'w\.sound: cannot be written'),
@@ -84,6 +86,22 @@ def test_errors_are_one_line_and_exit_code_2(capsys, arguments, complaint) -> No
     assert out == ''
     assert err.count('\n') == 1
     assert re.search(complaint, err)
+
+
+def test_an_interrupted_picture_is_one_line(capsys, monkeypatch) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr('beacon_comm.cli.encode.save_waveform', interrupted)
+    assert run(capsys, 'S', '--plot', 'w.png') == (2, '', 'beacon_encode: interrupted\n')
+
+
+def test_an_interrupt_waits_for_libraries() -> None:
+    loaded = False
+    with pytest.raises(KeyboardInterrupt), interrupts_held():
+        signal.raise_signal(signal.SIGINT)
+        loaded = True
+    assert loaded
 
 
 def test_text_from_standard_input(capsys, monkeypatch) -> None:

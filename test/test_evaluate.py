@@ -230,6 +230,14 @@ def test_a_damaged_bag_keeps_what_could_be_read(bag, capsys, tmp_path) -> None:
     assert 'damaged.mcap' in out
 
 
+def test_a_refused_json_file_costs_no_evaluation(mat_file, capsys, tmp_path) -> None:
+    code, out, err = run(capsys, mat_file, '--bit-rate', '3125', '--json', tmp_path / 'absent' / 'out.json')
+    assert (code, out) == (2, '')
+    assert 'no such folder' in err
+    assert run(capsys, tmp_path / 'absent.mat', '--json', tmp_path / 'out.json')[0] == 2
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize(
     ('arguments', 'complaint'),
     [
@@ -245,7 +253,11 @@ def test_a_damaged_bag_keeps_what_could_be_read(bag, capsys, tmp_path) -> None:
         (('x.mat', '--set', 'hop'), '--set hop: must be NAME=VALUE'),
         (('x.mat', '--set', 'hops=1'), 'hops: no such parameter'),
         (('x.mat', '--params', 'absent.yaml'), 'absent.yaml: cannot be read'),
-        (('x.mat', '--camera', 'absent.yaml'), 'absent.yaml'),
+        (('x.mat', '--truth', '/nonexist'), '/nonexist: no such file'),
+        (('x.mat', '--camera', 'absent.yaml'), '--camera absent.yaml: cannot be read (No such file or directory)\n'),
+        (('x.mat', '--camera', str(PROJECT / 'setup.cfg')), f'--camera {PROJECT / "setup.cfg"}: '),
+        (('x.mat', '--json', '/absent/out.json'), '--json /absent/out.json: cannot be written (no such folder)'),
+        (('x.mat', '--json', str(PROJECT)), f'--json {PROJECT}: cannot be written (is a folder)'),
         (('x.mat', '--duration', '-1'), '--duration'),
     ],
 )

@@ -109,6 +109,12 @@ def test_a_scene_is_written_with_its_truth(mat: Path, bag: Path, tmp_path: Path)
         (['{mat}', '--disc', '900,10'], 'x must lie in [4, 635] px'),
         (['{mat}', '--clip', '9'], 'no events in the clip from 9 s'),
         (['{mat}', '--sensor', 'big'], "argument --sensor: 'big': must be like 640x480"),
+        (['{mat}', '--sensor', '0x0'], '--sensor 0x0: must be from 1x1 to 2048x2048'),
+        (['{mat}', '--sensor', '640x5000'], '--sensor 640x5000: must be from 1x1'),
+        (['{mat}', '--sensor', '8x8'], 'does not fit on the 8×8 sensor'),
+        (['{bag}', '--start', '100'], 'bag: nothing in the part asked for, from 100 s on'),
+        (['{bag}', '--start', '100', '--write', '{bag}/out'], 'bag: nothing in the part asked for, from 100 s on'),
+        (['{mat}', '--start', '100'], 'one.mat: nothing in the part asked for, from 100 s on'),
         (['{mat}', '--rate', '-1'], '--rate -1: must be 0 or more'),
         (['{mat}', '--duration', '0'], '--duration 0: must be above 0'),
         (['{mat}', '--write', 'x', '--loop'], '--write with --loop would never end'),
@@ -127,6 +133,13 @@ def test_errors_are_one_line_and_exit_code_2(
     printed = capsys.readouterr()
     assert code == 2
     assert reason in printed.err and printed.err.count('\n') == 1 and printed.out == ''
+
+
+def test_the_help_tells_of_remapping_and_of_a_scenes_time(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(['--help'])
+    printed = capsys.readouterr().out
+    assert '--ros-args -r' in printed and '1.7e9 s' in printed
 
 
 def test_a_looped_bag_is_paced_on_from_its_end(bag: Path) -> None:
@@ -267,6 +280,46 @@ def test_loop_ends_with_ctrl_c(bag: Path, listener: Listener) -> None:
     finally:
         code, printed = replay.end()
     assert (code, printed) == (0, '')
+
+
+@pytest.mark.parametrize('write', [False, True])
+def test_further_ctrl_c_cut_nothing_short(write: bool, bag: Path, mat: Path, tmp_path: Path, domain: int) -> None:
+    out = tmp_path / 'out'
+    command = [mat, '--duration', '1e6', '--write', out] if write else [bag, '--rate', '0.01', '--wait-subscribers', '0.01']
+
+    def written() -> int:
+        return sum(file.stat().st_size for file in out.glob('*.mcap'))
+
+    replay = Replay(*command)
+    try:
+        deadline_s = time.monotonic() + BOUND_S
+        while not (written() > 100_000 if write else replay.printed):
+            assert time.monotonic() < deadline_s and not replay.ended()
+            time.sleep(0.05)
+        while not replay.ended():
+            assert time.monotonic() < deadline_s
+            replay.process.send_signal(signal.SIGINT)
+            time.sleep(0.02)
+    finally:
+        code, printed = replay.end()
+    assert code == 130
+    assert 'Traceback' not in printed
+    if write:
+        assert f'{len(messages(out))} messages written' in printed
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'reason'),
+    [
+        (['--topic', 'bad topic'], "topic 'bad topic': Invalid topic name: topic name must not contain"),
+        (['--ros-args', '-r', 'bogus'], 'ROS does not start with --ros-args -r bogus: failed'),
+        (['--ros-args', '--bogus'], 'ROS does not start with --ros-args --bogus: '),
+    ],
+)
+def test_what_ros_refuses_is_one_line(arguments: list[str], reason: str, mat: Path, domain: int) -> None:
+    code, printed = Replay(mat, *arguments).end()
+    assert code == 2
+    assert reason in printed and printed.count('\n') == 1
 
 
 def test_without_a_subscriber_it_says_so_and_goes_on(bag: Path, domain: int) -> None:

@@ -49,6 +49,17 @@ def test_what_is_no_text_is_named(tmp_path) -> None:
         load_truth('')
 
 
+@pytest.mark.parametrize('path', ['/nonexist', 'texts/absent', '/' + 300 * 'a'])
+def test_a_path_is_not_taken_for_a_text(path) -> None:
+    with pytest.raises(RecordingError, match=f'^{path}: no such file'):
+        load_truth(path)
+
+
+@pytest.mark.parametrize('text', ['on / off', 'on/off, and on', 'on/off\n', 300 * 'a', 'a/' * 600])
+def test_a_text_may_hold_a_slash(text) -> None:
+    assert load_truth(text) == text
+
+
 # Start of truth character `first` (s), bit rate, first and stop: measured on the recordings.
 PARTS = {
     '504hz_30m': ((0.0109, 503.82, 53, 618), (12.3804, 503.83, 0, 264)),

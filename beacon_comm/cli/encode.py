@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import shutil
 import sys
 from collections.abc import Sequence
@@ -11,9 +12,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from beacon_comm.cli.interrupts import ignore_interrupts, interrupts_held
 from beacon_comm.cli.parser import EXIT_ERROR, EXIT_OK, OneLineParser
 from beacon_comm.cli.waveform import frame_parts, save_waveform, terminal_waveform, visible
-from beacon_comm.core.errors import BeaconCommError, FramingError
+from beacon_comm.core.errors import BeaconCommError, FramingError, ParameterError
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.framing import CharacterFrame, transitions
 from beacon_comm.core.parameters import Declaration, Parameters, declarations
@@ -51,8 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
     arguments = make_parser().parse_args(argv)
     try:
-        options = {name: getattr(arguments, name) for name in FRAME_OPTIONS}
-        parameters = Parameters(bit_rates=(arguments.bit_rate,), **options)
+        parameters = _parameters(arguments)
         frame = CharacterFrame.from_parameters(parameters)
         (bit_rate_bps,) = parameters.bit_rates
         text = sys.stdin.read() if arguments.text == '-' else arguments.text
@@ -60,17 +61,32 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise FramingError('no text to encode')
         bits = frame.encode_bits(text)
         if arguments.plot not in (None, TERMINAL):
-            save_waveform(arguments.plot, text, bits, frame, bit_rate_bps)
+            with interrupts_held():  # a second or two, and no half image
+                save_waveform(arguments.plot, text, bits, frame, bit_rate_bps)
         print(OUTPUTS[arguments.output_format](text, bits, frame, bit_rate_bps))
         if arguments.plot == TERMINAL:
             print('\n' + terminal_waveform(text, bits, frame, shutil.get_terminal_size((100, 24)).columns))
     except BeaconCommError as error:
         print(f'{NAME}: {error}', file=sys.stderr)
         return EXIT_ERROR
+    except KeyboardInterrupt:
+        if argv is None:
+            ignore_interrupts()  # a second Ctrl-C must not cut the process's end short
+        print(f'{NAME}: interrupted', file=sys.stderr)
+        return EXIT_ERROR
     except BrokenPipeError:
         sys.stderr.close()  # the reader has gone: nothing to say, and nobody to say it to
         return EXIT_ERROR
     return EXIT_OK
+
+
+def _parameters(arguments: argparse.Namespace) -> Parameters:
+    try:
+        return Parameters(
+            bit_rates=(arguments.bit_rate,), **{name: getattr(arguments, name) for name in FRAME_OPTIONS}
+        )
+    except ParameterError as error:
+        raise ParameterError(re.sub('^bit_rates =', '--bit-rate', str(error))) from error
 
 
 def text_output(text: str, bits: NDArray[np.uint8], frame: CharacterFrame, bit_rate_bps: float) -> str:

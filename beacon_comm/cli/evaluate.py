@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from beacon_comm.cli.parameter_arguments import add_parameter_arguments, parameters_from
 from beacon_comm.cli.parser import EXIT_ERROR, EXIT_OK, OneLineParser
-from beacon_comm.core.errors import BeaconCommError, RecordingError
+from beacon_comm.core.errors import BeaconCommError, CalibrationError, RecordingError
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.evaluation.report import listed, published_table, recordings_table, scores_table, texts_table
 from beacon_comm.evaluation.result import RecordingResult
 from beacon_comm.evaluation.result_json import write_json
 from beacon_comm.evaluation.truth import load_truth
+
+if TYPE_CHECKING:
+    from beacon_comm.core.bearing import CameraModel
 
 NAME = 'beacon_evaluate'
 
@@ -59,17 +65,17 @@ def _run(arguments: argparse.Namespace) -> int:
     # Imported here: the kernels' libraries take a second, and --help and wrong arguments need none of them.
     from beacon_comm.cli.offline import Options, evaluate_recording, is_mat
     from beacon_comm.compiling.warm_up import warm_up
-    from beacon_comm.core.bearing import CameraModel
 
     if arguments.start < 0.0 or (arguments.duration is not None and arguments.duration <= 0.0):
         raise RecordingError('--start must not be negative, --duration must be more than 0')
+    _check_writable(arguments.json)
     parameters, passed_over = parameters_from(arguments)
     if passed_over:
         print(f"{NAME}: {arguments.params}: not the receiver's, passed over: {', '.join(passed_over)}", file=sys.stderr)
     options = Options(
         parameters,
         _truth(arguments.truth, parameters),
-        None if arguments.camera is None else CameraModel.from_yaml(arguments.camera),
+        _camera(arguments.camera),
         arguments.topic,
         arguments.start,
         arguments.duration,
@@ -121,6 +127,35 @@ def _truth(argument: str | None, parameters: Parameters) -> str | None:
     text = load_truth(argument)
     CharacterFrame.from_parameters(parameters).encode_bits(text)
     return text
+
+
+def _camera(path: str | None) -> CameraModel | None:
+    if path is None:
+        return None
+    from beacon_comm.core.bearing import CameraModel
+
+    try:
+        return CameraModel.from_yaml(path)
+    except CalibrationError as error:
+        if isinstance(error.__cause__, OSError):
+            raise CalibrationError(f'--camera {path}: cannot be read ({error.__cause__.strerror})') from error
+        raise CalibrationError(f'--camera {error}') from error
+
+
+def _check_writable(name: str | None) -> None:
+    """Refuse a file that cannot be written in the end, before anything is evaluated; nothing is made yet."""
+    if name is None:
+        return
+    file = Path(name)
+    if os.path.isdir(file):
+        why = 'is a folder'
+    elif not os.path.isdir(file.parent):
+        why = 'no such folder'
+    elif not os.access(file if os.path.lexists(file) else file.parent, os.W_OK):
+        why = 'no permission'
+    else:
+        return
+    raise RecordingError(f'--json {name}: cannot be written ({why})')
 
 
 def _complain(text: str) -> int:

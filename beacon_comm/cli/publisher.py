@@ -1,13 +1,12 @@
 """Publishing raw messages at their pace; the part of ``beacon_replay`` that needs ROS.
 
-    messages ──→ first one fetched ──→ a subscriber awaited (bounded) ──→ each published when its time has come
+    messages, the first one fetched ──→ a subscriber awaited (bounded) ──→ each published when its time has come
 """
 
 from __future__ import annotations
 
 import importlib
-import itertools
-import signal
+import re
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -17,6 +16,7 @@ from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
+from beacon_comm.cli.interrupts import uninterrupted
 from beacon_comm.cli.progress import progress
 from beacon_comm.core.errors import BeaconCommError
 from beacon_comm.core.events import NS_PER_S
@@ -32,7 +32,7 @@ _CLOCK_STEP_NS = 10_000_000
 
 
 class PublishError(BeaconCommError):
-    """Nothing can be published: no ROS, or no Python package of the message type."""
+    """Nothing can be published: no ROS, no Python package of the message type, or arguments that ROS refuses."""
 
 
 class PacedMessage(NamedTuple):
@@ -49,7 +49,7 @@ class Playback:
 
     Attributes:
         topic, type: the topic's name and message type.
-        messages: in the order they are published.
+        messages: in the order they are published; the first is best at hand already, for the clock begins with it.
         total: how many there are, None: not known or endless.
         rate: speed, 1.0 is the recording's own, 0.0 as fast as it goes.
         reliable: reliable instead of best effort.
@@ -76,33 +76,26 @@ def publish(playback: Playback, ros_arguments: Sequence[str] = ()) -> None:
     """Publish a playback.
 
     Raises:
-        PublishError: no ROS, or no Python package of the message type.
+        PublishError: no ROS, no Python package of the message type, or a topic or arguments that ROS refuses.
         RecordingError: the recording is damaged; what could be read was published.
     """
     message_class = _message_class(playback.type)
-    messages = iter(playback.messages)
-    first = next(messages, None)  # decoding and compiling begin before the clock does
-    if first is None:
-        note('nothing to publish in this part of the recording')
-        return
     with _node(ros_arguments) as node:
-        publisher = node.create_publisher(message_class, playback.topic, _qos(playback.reliable))
+        publisher = _publisher(node, message_class, playback)
         clock = _Clock(node) if playback.clock else None
         _await_subscriber(node, publisher, playback.wait_s)
-        late_s = _publish_paced(itertools.chain([first], messages), playback, publisher, clock)
+        late_s = _publish_paced(playback, publisher, clock)
         if late_s > _LATE_S:
             note(f'could not keep the pace: {late_s:.1f} s late at the worst')
         _drain(publisher, playback.reliable)
 
 
-def _publish_paced(
-    messages: Iterator[PacedMessage], playback: Playback, publisher: Any, clock: _Clock | None
-) -> float:
+def _publish_paced(playback: Playback, publisher: Any, clock: _Clock | None) -> float:
     """Publish and return by how much the worst message was late (s)."""
     begin_ns: int | None = None
     begin_s = time.monotonic()
     late_s = 0.0
-    for message in progress(messages, playback.topic, playback.total):
+    for message in progress(playback.messages, playback.topic, playback.total):
         if begin_ns is None:
             begin_ns = message.pace_ns
         if playback.rate > 0.0:
@@ -155,6 +148,21 @@ def _message_class(message_type: str) -> type:
     )
 
 
+def _publisher(node: Any, message_class: type, playback: Playback) -> Any:
+    from rclpy.exceptions import NameValidationException
+
+    try:
+        return node.create_publisher(message_class, playback.topic, _qos(playback.reliable))
+    except (NameValidationException, RuntimeError) as error:
+        raise PublishError(f'topic {playback.topic!r}: {_one_line(error)}') from error
+
+
+def _one_line(error: Exception) -> str:
+    """Return what ROS says, without the places in its source and the picture of a name below its text."""
+    text = str(error).split(':\n')[0]
+    return ' '.join(re.sub(r', at [^\s,]+:\d+', '', text).split())
+
+
 def _qos(reliable: bool) -> Any:
     from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 
@@ -169,19 +177,26 @@ def _qos(reliable: bool) -> Any:
 def _node(ros_arguments: Sequence[str]) -> Iterator[Any]:
     try:
         import rclpy
+        from rclpy.logging import LoggingSeverity, set_logger_level
         from rclpy.signals import SignalHandlerOptions
     except ImportError as error:
         raise PublishError(f'publishing needs ROS 2 ({error}); source it, or use --write OUT') from error
     # Ctrl-C stays Python's KeyboardInterrupt: rclpy's own handler would only end the context.
-    rclpy.init(args=['beacon_replay', *ros_arguments], signal_handler_options=SignalHandlerOptions.NO)
-    node = rclpy.create_node('beacon_replay')
+    set_logger_level('rcl', LoggingSeverity.FATAL)  # it would say first, in a line of its own, what is raised anyway
+    try:
+        rclpy.init(args=['beacon_replay', *ros_arguments], signal_handler_options=SignalHandlerOptions.NO)
+        set_logger_level('rcl', LoggingSeverity.UNSET)
+        node = rclpy.create_node('beacon_replay')
+    except RuntimeError as error:  # the base of everything that rclpy raises here
+        rclpy.try_shutdown()
+        given = ' '.join(('', 'with', *ros_arguments)) if ros_arguments else ''
+        raise PublishError(f'ROS does not start{given}: {_one_line(error)}') from error
     try:
         yield node
     finally:
-        previous = signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C must not cut this short
-        node.destroy_node()
-        rclpy.try_shutdown()
-        signal.signal(signal.SIGINT, previous)
+        with uninterrupted():
+            node.destroy_node()
+            rclpy.try_shutdown()
 
 
 def _await_subscriber(node: Any, publisher: Any, wait_s: float) -> None:

@@ -14,6 +14,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from beacon_comm.cli.interrupts import ignore_interrupts
 from beacon_comm.cli.parser import EXIT_ERROR, OneLineParser
 from beacon_comm.core.errors import BeaconCommError, ParameterError
 
@@ -28,6 +29,11 @@ Repeat --disc and --clip once for each .mat recording, in their order.
                                      time 0, and how often it comes in a row.  Default: all of it, once.
 Every clip begins at scene time 0.  The scene ends with its last clip, or after --duration; the background is
 looped for as long as it lasts.
+
+A scene's stamps, and the /clock of --clock, begin at a fixed time, 1.7e9 s (14 November 2023), so that the same scene
+gives the same bytes; a bag's are the recorded ones.
+
+ROS arguments come last: --ros-args -r /event_camera/events:=/front/events publishes on another topic, a bag's too.
 
 exit codes: 0 done, 2 an error (one line says which), 130 Ctrl-C before the end (0 with --loop)
 """
@@ -47,6 +53,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_ERROR
     except KeyboardInterrupt:
         return 0 if options.loop else EXIT_INTERRUPTED
+    finally:
+        if arguments is None:
+            ignore_interrupts()  # a second Ctrl-C must not cut the process's end short
     return 0
 
 
@@ -68,7 +77,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--loop', action='store_true', help='over and over, until Ctrl-C')
     add('--start', type=float, default=0.0, metavar='S', help='begin so many seconds into it')
     add('--duration', type=float, metavar='S', help='end so many seconds later')
-    add('--clock', action='store_true', help='publish /clock: the recorded time')
+    add('--clock', action='store_true', help='publish /clock: the recorded time; see below')
     add('--topic', metavar='NAME', help=f"the bag's event topic; of a scene: where to publish ({EVENT_TOPIC})")
     add('--reliable', action='store_true', help='publish reliably instead of best effort')
     add('--wait-subscribers', type=float, default=10.0, metavar='S', help='longest wait for a subscriber (default 10)')

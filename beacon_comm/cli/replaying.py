@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 
+from beacon_comm.cli.interrupts import uninterrupted
 from beacon_comm.cli.progress import progress
 from beacon_comm.cli.publisher import PacedMessage, Playback, note, publish
 from beacon_comm.cli.replay import EVENT_TOPIC
-from beacon_comm.core.errors import RecordingError
+from beacon_comm.core.errors import ParameterError, RecordingError
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.recordings.bag_writer import BagWriter
 from beacon_comm.recordings.bags import Bag, open_recording
@@ -18,6 +21,7 @@ from beacon_comm.recordings.scene import Scene
 from beacon_comm.recordings.sources import Background, Clip, mat_beacon
 from beacon_comm.recordings.storage import TopicInfo
 from beacon_comm.recordings.truth import TRUTH_NAME, write_truth
+from beacon_comm.wire.evt3_encoder import MAX_SIDE_PX
 
 DEFAULT_SENSOR = (640, 480)
 
@@ -88,6 +92,9 @@ def make_scene(options: argparse.Namespace) -> Scene:
     Raises:
         RecordingError, ParameterError: a recording or an option that does not work.
     """
+    if options.sensor is not None and not all(1 <= side <= MAX_SIDE_PX for side in options.sensor):
+        size, most = ('x'.join(map(str, sides)) for sides in (options.sensor, (MAX_SIDE_PX, MAX_SIDE_PX)))
+        raise ParameterError(f'--sensor {size}: must be from 1x1 to {most}')
     background = None
     if options.background is not None:
         background = Background(options.background, options.background_topic)
@@ -118,12 +125,17 @@ def _deliver(
     messages: Iterator[PacedMessage],
     total: int | None,
 ) -> None:
+    first = next(messages, None)  # decoding and compiling begin before the clock does
+    if first is None:
+        names = ', '.join(map(str, options.recordings))
+        raise RecordingError(f'{names}: nothing in the part asked for, from {options.start:g} s on')
+    whole = itertools.chain([first], messages)
     if options.write is None:
         publish(
             Playback(
                 topic,
                 message_type,
-                messages,
+                whole,
                 total,
                 options.rate,
                 options.reliable,
@@ -135,14 +147,17 @@ def _deliver(
         return
     stopped: BaseException | None = None
     count = 0
-    with BagWriter(options.write) as writer:
-        writer.add_topic(topic, message_type)
+    with ExitStack() as ending, BagWriter(options.write) as writer:
         try:
-            for message in progress(messages, str(options.write), total):
+            writer.add_topic(topic, message_type)
+            for message in progress(whole, str(options.write), total):
                 writer.write(topic, message.recorded_ns, message.cdr)
                 count += 1
         except (RecordingError, KeyboardInterrupt) as error:
             stopped = error  # what was written so far becomes a whole bag
-    note(f'{count} messages written to {options.write}')
+        finally:
+            ending.enter_context(uninterrupted())  # until the bag is closed
+    if count:
+        note(f'{count} messages written to {options.write}')
     if stopped is not None:
         raise stopped

@@ -9,6 +9,7 @@ it was checked against their events.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from beacon_comm.core.errors import RecordingError
@@ -38,12 +39,17 @@ BUILT_IN = {'sonnet18': SONNET18}
 LONGEST_PATH = 1000
 
 
+def _may_be_path(argument: str) -> bool:
+    return len(argument) <= LONGEST_PATH and '\n' not in argument and '\0' not in argument
+
+
 def load_truth(argument: str) -> str:
     """Return the text that ``argument`` stands for.
 
     Args:
         argument: the name of a built-in text (``sonnet18``), else the path of a text file if there is one (every
-            byte of it is truth, a line feed at its end too), else the text itself.
+            byte of it is truth, a line feed at its end too), else the text itself.  One that looks like a path
+            (ends in .txt, or has a slash and no white space) must be a file's.
 
     Returns:
         The text, one character for each that was sent; never empty.
@@ -54,13 +60,15 @@ def load_truth(argument: str) -> str:
     if argument in BUILT_IN:
         return BUILT_IN[argument]
     path = Path(argument)
-    if len(argument) <= LONGEST_PATH and '\n' not in argument and '\0' not in argument and path.is_file():
+    if _may_be_path(argument) and os.path.isfile(path):  # unlike Path.is_file, it knows no error
         try:
             text = path.read_bytes().decode('utf-8')
         except (OSError, UnicodeDecodeError) as error:
             raise RecordingError(f'{path}: not a readable text file ({error})') from error
     elif path.suffix.lower() == '.txt' and '\n' not in argument:
         raise RecordingError(f'{path}: no such file')
+    elif _may_be_path(argument) and '/' in argument and not any(symbol.isspace() for symbol in argument):
+        raise RecordingError(f'{argument}: no such file (a text with a slash and no space must come in a file)')
     else:
         text = argument
     if not text:

@@ -46,6 +46,8 @@ class Disc:
         values = (self.x_px, self.y_px, self.radius_px, self.vx_px_per_s, self.vy_px_per_s)
         if not all(math.isfinite(value) for value in values) or self.radius_px <= 0:
             raise ParameterError(f'disc {self.text()}: needs finite numbers and a radius above 0')
+        if 2 * self.radius_px > min(self.width, self.height) - 1:
+            raise ParameterError(f'disc {self.text()}: does not fit on the {self.width}×{self.height} sensor')
         for name, at, size in (('x', self.x_px, self.width), ('y', self.y_px, self.height)):
             if not self.radius_px <= at <= size - 1 - self.radius_px:
                 raise ParameterError(
