@@ -140,11 +140,11 @@ def test_a_text_with_runs_only_delays(text: str) -> None:
 def test_a_period_with_errors_and_slips_is_refused(
     period: int, letters: list[int], wrong: list[tuple[int, int]], slips: list[int]
 ) -> None:
-    """Wrong codes with right parity at every 28th character or so, and characters lost, leave a period a period."""
-    codes = [letters[k % period] for k in range(210)]
+    """Every 28th code wrong, its parity right, and every 33rd character lost, at most, leave a period a period."""
+    codes = [letters[k % period] for k in range(231)]
     for place, code in {place // 28: (place // 28 * 28, code) for place, code in wrong}.values():
         codes[place] = code
-    for place in sorted({slip // 33: slip for slip in slips}.values(), reverse=True):
+    for place in sorted({slip // 33 * 33 + 16 for slip in slips}, reverse=True):
         del codes[place]
     record = ParityRecord(Parameters())
     assert verdicts(record, characters(map(chr, codes))) == {}
