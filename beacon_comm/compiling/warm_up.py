@@ -16,12 +16,11 @@ from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.receiver import Receiver, SignalReceiver
 from beacon_comm.wire.cdr import build_event_packet
 from beacon_comm.wire.evt3_encoder import Evt3Encoder
-from beacon_comm.wire.stream import EventStream
+from beacon_comm.wire.stream import PACKET_TYPES, EventStream
 
 SIZE = 16
 PACKETS = 8
 ENCODINGS = ('libcaer_cmp', 'libcaer', 'mono')
-EVENT_PACKET = 'event_camera_msgs/msg/EventPacket'
 
 
 def synthetic_beacon(parameters: Parameters, seconds: float = 0.6) -> EventBatch:
@@ -56,7 +55,7 @@ def warm_up(parameters: Parameters, pixels: bool = True) -> None:
         signal_receiver.flush()
         return
     receiver = Receiver(parameters, (SIZE, SIZE))
-    stream, encoder = EventStream(EVENT_PACKET), Evt3Encoder(SIZE, SIZE)
+    stream, encoder = EventStream(PACKET_TYPES[0]), Evt3Encoder(SIZE, SIZE)
     cuts = np.linspace(0, len(events), PACKETS + 1).astype(int)
     for sequence, (start, stop) in enumerate(zip(cuts[:-1], cuts[1:], strict=True)):
         end_ns = events.t_end_ns if stop == len(events) else int(events.t_ns[stop])
@@ -66,7 +65,7 @@ def warm_up(parameters: Parameters, pixels: bool = True) -> None:
     receiver.flush()
     receiver.beacons()
     for encoding in ENCODINGS:
-        EventStream(EVENT_PACKET).push(_packet(encoding, bytes(64), 0))
+        EventStream(PACKET_TYPES[0]).push(_packet(encoding, bytes(64), 0))
 
 
 def _packet(encoding: str, payload: bytes, sequence: int) -> bytes:

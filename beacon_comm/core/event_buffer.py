@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beacon_comm.core.events import NS_PER_S
+from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.parameters import Parameters
 
 EVENT_BYTES = 9  # int64 time and int8 polarity
@@ -87,6 +88,6 @@ class EventBuffer:
 
 def buffer_length_ns(parameters: Parameters) -> int:
     """Return how long a track's events are kept (ns): a time, or characters of the slowest listed rate."""
-    frame_bits = 1 + parameters.data_bits + (parameters.parity != 'none') + parameters.stop_bits
+    frame_bits = CharacterFrame.from_parameters(parameters).length
     characters_s = parameters.buffer_characters * frame_bits * parameters.slowest_bit_s
     return round(max(parameters.buffer_min_s, characters_s) * NS_PER_S)

@@ -26,6 +26,7 @@ from beacon_comm.core.candidates import BeaconState, CandidateSlots, ReceivedCha
 from beacon_comm.core.demodulator import make_demodulator
 from beacon_comm.core.detection import Detector
 from beacon_comm.core.events import NS_PER_S, EventBatch
+from beacon_comm.core.index_image import hop_length_ns
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.routing import Routed
 from beacon_comm.core.signal_detection import WholeSignal
@@ -125,7 +126,7 @@ class Receiver:
         self._detection = Detector(parameters, sensor_size) if detection is None else detection
         self._slots = CandidateSlots(parameters, make_demodulator)
         self._camera = camera
-        self._hop_ns = round(parameters.hop_s * NS_PER_S)
+        self._hop_ns = hop_length_ns(parameters)
         self._t_ns: int | None = None
         self._confirmed: tuple[int, ...] = ()
 
