@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -539,7 +540,11 @@ def main() -> None:
             outcomes[receiver] += some
         print(f'\r{done} of {len(jobs)}', end='', file=sys.stderr, flush=True)
     print(file=sys.stderr)
-    page = text_of(outcomes, sys.argv[1:])
+    shown = ['--full'] if arguments.full else []
+    for option in ('count', 'seed', 'families', 'receivers'):
+        if getattr(arguments, option) not in (None, parser.get_default(option)):
+            shown += [f'--{option}', shlex.quote(str(getattr(arguments, option)))]
+    page = text_of(outcomes, shown)
     if arguments.output is not None:
         arguments.output.write_text(page)
     else:
