@@ -9,10 +9,11 @@ All times of the results are recording time: ns since the recording's first even
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from beacon_comm.cli.bag_pieces import BagPieces
 from beacon_comm.cli.collector import Collector
@@ -87,20 +88,10 @@ def _evaluate_mat(path: str, options: Options) -> RecordingResult:
     t_ns, polarity = t_ns[part], polarity[part]
     if not len(t_ns):
         raise RecordingError(f'{path}: no events in the part asked for, from {options.start_s:g} s on')
-    receiver = SignalReceiver(options.parameters)
-    collector = Collector()
     begun_s = time.perf_counter()
-    last_ns = int(t_ns[-1])
-    cuts_ns = [*range(int(t_ns[0]) + MAT_BATCH_NS, last_ns, MAT_BATCH_NS), last_ns]
-    stops = [*(int(stop) for stop in np.searchsorted(t_ns, cuts_ns[:-1])), len(t_ns)]
-    start = 0
-    for cut_ns, stop in progress(zip(cuts_ns, stops, strict=True), path, len(cuts_ns)):
-        collector.take(receiver.push_signal(t_ns[start:stop], polarity[start:stop], cut_ns), receiver)
-        start = stop
-    collector.take(receiver.flush(), receiver)
-    collector.sample(receiver.beacons())
+    beacon = receive_signal(t_ns, polarity, options.parameters, path)
     processing_s = time.perf_counter() - begun_s
-    beacon = collector.whole_signal()
+    last_ns = int(t_ns[-1])
     if options.truth is not None:
         transmissions = _scores(beacon, options, (begin_ns, last_ns), Signal(t_ns, polarity))
         if not transmissions:
@@ -117,6 +108,34 @@ def _evaluate_mat(path: str, options: Options) -> RecordingResult:
         beacons=(beacon,),
         silent_tracks=0,
     )
+
+
+def receive_signal(
+    t_ns: NDArray[np.int64], polarity: NDArray[np.int8], parameters: Parameters, title: str | None = None
+) -> BeaconResult:
+    """Run the receiver over one beacon's events, in pieces of 100 ms.
+
+    Args:
+        t_ns: times (ns), non-decreasing, ``(n,)`` int64; ``n`` at least 1.
+        polarity: +1 or -1, ``(n,)`` int8.
+        parameters: the receiver's.
+        title: of the progress bar; None: there is none.
+    """
+    receiver = SignalReceiver(parameters)
+    collector = Collector()
+    last_ns = int(t_ns[-1])
+    cuts_ns = [*range(int(t_ns[0]) + MAT_BATCH_NS, last_ns, MAT_BATCH_NS), last_ns]
+    stops = [*(int(stop) for stop in np.searchsorted(t_ns, cuts_ns[:-1])), len(t_ns)]
+    pieces: Iterable[tuple[int, int]] = zip(cuts_ns, stops, strict=True)
+    if title is not None:
+        pieces = progress(pieces, title, len(cuts_ns))
+    start = 0
+    for cut_ns, stop in pieces:
+        collector.take(receiver.push_signal(t_ns[start:stop], polarity[start:stop], cut_ns), receiver)
+        start = stop
+    collector.take(receiver.flush(), receiver)
+    collector.sample(receiver.beacons())
+    return collector.whole_signal()
 
 
 def _evaluate_bag(path: str, pieces: BagPieces, options: Options) -> RecordingResult:

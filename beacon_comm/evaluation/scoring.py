@@ -180,6 +180,42 @@ def score(
     return tuple(transmissions)
 
 
+def score_at(
+    characters: Sequence[Character],
+    truth: str,
+    sent: Sequence[Transmission],
+    frame: CharacterFrame | None = None,
+) -> tuple[Transmission, ...]:
+    """Score one beacon's decoded characters where it is known when what was sent.
+
+    Nothing is searched for, so that a stream of which hardly anything can be read counts in full.
+
+    Args:
+        characters: what was decoded.
+        truth: text that was sent.
+        sent: sendings that were found before, in the same recording; only their time, rate and extent are used.
+        frame: layout of a character on the line; the default layout if None.
+
+    Returns:
+        One score for each of ``sent``, of exactly its characters; a sending without a start has none.
+
+    Raises:
+        FramingError: a character of the truth does not fit into the data bits.
+    """
+    frame = CharacterFrame() if frame is None else frame
+    ordered = sorted(characters, key=lambda character: character.t_ns)
+    t_ns = np.array([character.t_ns for character in ordered], np.int64)
+    transmissions = []
+    for known in sent:
+        if known.start_ns is None or known.bit_rate_bps is None:
+            continue
+        first, stop = known.first, known.first + known.characters
+        sending = Sending(known.start_ns, frame.length * 1e9 / known.bit_rate_bps, first, stop - 1, 0.0)
+        a, b = np.searchsorted(t_ns, np.rint([sending.due_ns(first - 0.25), sending.due_ns(stop - 0.25)]))
+        transmissions.append(_transmission(sending, first, stop, ordered[a:b], truth, frame))
+    return tuple(transmissions)
+
+
 def not_found(truth: str, frame: CharacterFrame | None = None) -> Transmission:
     """Return the score of a beacon in which no start was found: message accuracy 0, bit accuracy 0.5."""
     n = len(truth)
