@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from beacon_comm.cli.parameter_arguments import add_parameter_arguments, parameters_from
 from beacon_comm.cli.parser import EXIT_ERROR, EXIT_OK, OneLineParser
-from beacon_comm.core.errors import BeaconCommError, CalibrationError, RecordingError
+from beacon_comm.core.errors import BeaconCommError, CalibrationError, ParameterError, RecordingError
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.evaluation.report import listed, published_table, recordings_table, scores_table, texts_table
@@ -33,7 +35,10 @@ def make_parser() -> argparse.ArgumentParser:
         epilog='Exit code 0: all was read; 2: an error, or something could not be read (the rest is shown).',
     )
     parser.add_argument(
-        'recordings', metavar='RECORDING', nargs='+', help="a bag (rosbag2, ROS 1) or a .mat file of one beacon's events"
+        'recordings',
+        metavar='RECORDING',
+        nargs='*',
+        help="a bag (rosbag2, ROS 1) or a .mat file of one beacon's events (with --stress by default the paper's at 30 m)",
     )
     parser.add_argument(
         '--truth', metavar='TEXT', help='what was sent: sonnet18, a text file (every byte of it counts), or the text'
@@ -44,14 +49,27 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--topic', help='event topic of the bags (default: the only one)')
     parser.add_argument('--start', type=float, default=0.0, metavar='S', help='seconds of each recording to leave out')
     parser.add_argument('--duration', type=float, metavar='S', help='seconds to evaluate (default: to the end)')
+    stress = parser.add_argument_group('stress', 'Every receiver over waveforms made harder to read, step by step.')
+    stress.add_argument(
+        '--stress', metavar='DIR', help='write stress.md, stress.json and figures/stress_*.png there (some minutes)'
+    )
+    stress.add_argument('--stress-only', metavar='NAME[,NAME…]', help='stresses to run (default: all), e.g. thinned,clock')
+    stress.add_argument(
+        '--stress-simulated',
+        metavar='BPS[,BPS…]',
+        help='bit rates to simulate the truth at, beside the recordings; none: only the recordings (default: 504,1000,3125)',
+    )
     return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
-    arguments = make_parser().parse_args(argv)
+    parser = make_parser()
+    arguments = parser.parse_args(argv)
+    if not arguments.recordings and arguments.stress is None:
+        parser.error('the following arguments are required: RECORDING')
     try:
-        return _run(arguments)
+        return _run(arguments) if arguments.stress is None else _stress(arguments)
     except BeaconCommError as error:
         return _complain(str(error))
     except KeyboardInterrupt:
@@ -98,6 +116,68 @@ def _run(arguments: argparse.Namespace) -> int:
         if arguments.json is not None:
             write_json(arguments.json, results)
     return code
+
+
+def _stress(arguments: argparse.Namespace) -> int:
+    """Measure every receiver under stress; write the tables and figures, and print the summary."""
+    from beacon_comm.evaluation.stress_report import require_matplotlib, summary_table, write_report
+
+    for name, unused in (('camera', None), ('json', None), ('topic', None), ('start', 0.0), ('duration', None)):
+        if getattr(arguments, name) != unused:
+            raise RecordingError(f'--{name} and --stress do not go together')
+    parameters, _ = parameters_from(arguments)
+    simulated_bps = _simulated_rates(arguments.stress_simulated, parameters)
+    truth = _truth(arguments.truth or 'sonnet18', parameters) or ''
+    folder = Path(arguments.stress)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RecordingError(f'--stress {folder}: cannot be made ({error.strerror})') from error
+    if not os.access(folder, os.W_OK):
+        raise RecordingError(f'--stress {folder}: cannot be written (no permission)')
+    require_matplotlib()
+    from beacon_comm.cli.stress import SIMULATED_BPS, default_recordings, run_stress  # loads the kernels
+
+    recordings = arguments.recordings or default_recordings()
+    if not recordings:
+        print(f'{NAME}: no recordings given and none in BEACON_COMM_DATA: simulated waveforms only', file=sys.stderr)
+    results = run_stress(
+        recordings,
+        truth,
+        parameters,
+        only=None if arguments.stress_only is None else arguments.stress_only.split(','),
+        receivers=None if arguments.receiver is None else [arguments.receiver],
+        simulated_bps=SIMULATED_BPS if simulated_bps is None else simulated_bps,
+    )
+    print(summary_table(results))
+    for path in write_report(folder, results, _command(arguments)):
+        print(f'{NAME}: wrote {path}', file=sys.stderr)
+    return EXIT_OK
+
+
+def _simulated_rates(text: str | None, parameters: Parameters) -> tuple[float, ...] | None:
+    if text is None:
+        return None
+    if text == 'none':
+        return ()
+    try:
+        rates = tuple(float(rate) for rate in text.split(','))
+        return replace(parameters, bit_rates=rates).bit_rates
+    except (ValueError, ParameterError) as error:
+        raise ParameterError(f'--stress-simulated {text}: must be bit rates with commas between them, or none') from error
+
+
+def _command(arguments: argparse.Namespace) -> str:
+    """Return the command line for the page, paths without the folders of this machine."""
+    words = [NAME, *(f'…/{Path(recording).name}' for recording in arguments.recordings)]
+    options = {'truth': '--truth', 'receiver': '--receiver', 'bit_rate': '--bit-rate', 'params': '--params'}
+    options |= {'stress_only': '--stress-only', 'stress_simulated': '--stress-simulated'}
+    for name, option in options.items():
+        if getattr(arguments, name) is not None:
+            words += [option, shlex.quote(getattr(arguments, name))]
+    for setting in arguments.set:
+        words += ['--set', shlex.quote(setting)]
+    return ' '.join([*words, '--stress', Path(arguments.stress).name or '.'])
 
 
 def print_results(results: Sequence[RecordingResult], scored: bool, comparable: bool) -> None:
