@@ -126,6 +126,7 @@ STRESSES = (
         (0.0, 1.0, 3.0, 10.0, 25.0, 50.0),
         0.0,
         50.0,
+        logarithmic=True,
     ),
     Stress(
         'fading',
@@ -332,7 +333,8 @@ def receivers_for(
     for name in names or ():
         if name not in found:
             raise ParameterError(f'receiver {name}: must be some of {", ".join(found)}')
-    return {name: setting for name, setting in found.items() if names is None or name in names}
+    ordered = sorted(found.items(), key=lambda entry: entry[0] != REFERENCE)  # the paper's first
+    return {name: setting for name, setting in ordered if names is None or name in names}
 
 
 def apply(name: str, severity: float, waveform: Waveform, other: Events) -> Stressed:

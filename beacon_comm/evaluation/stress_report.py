@@ -237,9 +237,11 @@ written by
 ```
 
 All characters count that the waveform holds before it is stressed, from the first one on: wrong are those decoded as
-another code, missing ones and inserted ones. Where they lie is known (a simulated text) or was found in the unstressed
-recording, and is carried through every change of the time axis; nothing is aligned anew, so a receiver that reads nothing
-has all of them wrong. Events reach the receivers in pieces of 100 ms. The random numbers of every stress have a fixed
+another code, missing ones and inserted ones. (What is read at wrong times counts twice, as missing and as inserted, so
+that there may be more than 100 %; the figures stop there.) Where the characters lie is known of a simulated text, and of
+a recording it is found before it is stressed; it is carried through every change of the time axis and nothing is aligned
+anew, so that a receiver that reads nothing has all of them wrong. Events reach the receivers in pieces of 100 ms, through
+the candidate slot with its parity record. The random numbers of every stress have a fixed
 seed; the simulated LED is the one of `simulation/led.py`."""
 
 SUMMARY_HEAD = """## In short
@@ -384,7 +386,10 @@ def _draw_panel(panel: Axes, results: StressResults, stress: Stress, waveform: s
             zorder=3 + place,
         )
     if stress.logarithmic:
-        panel.set_xscale('log')
+        if min(stress.severities) > 0.0:
+            panel.set_xscale('log')
+        else:
+            panel.set_xscale('symlog', linthresh=_least(stress), linscale=0.5)
         panel.xaxis.set_minor_locator(NullLocator())
     panel.xaxis.set_major_locator(FixedLocator(_spread(stress)))
     panel.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f'{x:g}'))
@@ -401,9 +406,16 @@ def _draw_panel(panel: Axes, results: StressResults, stress: Stress, waveform: s
         panel.spines[side].set_visible(False)
 
 
+def _least(stress: Stress) -> float:
+    """Return the smallest severity above 0: below it, a logarithmic axis that has a 0 is linear."""
+    return min(severity for severity in stress.severities if severity > 0.0)
+
+
 def _spread(stress: Stress) -> list[float]:
     """Return the severities that get a tick: none so close to one before that their numbers would touch."""
-    place = math.log10 if stress.logarithmic else float
+    def place(severity: float) -> float:
+        return math.log10(max(severity, 0.3 * _least(stress))) if stress.logarithmic else severity
+
     low, high = place(min(stress.severities)), place(max(stress.severities))
     ticks: list[float] = []
     for severity in sorted(stress.severities, reverse=stress.none == max(stress.severities)):

@@ -82,7 +82,7 @@ def clock_warp(t_ns: Times, ratio: float) -> Warp:
     _check('ratio', ratio, 1e-3, 1e3)
     begin, end = _span(t_ns)
     knots = np.array([begin, max(end, begin + 1.0)], np.float64)
-    return Warp(knots, np.asarray(begin + (knots - begin) / ratio, np.float64))
+    return Warp(knots, begin + (knots - begin) / ratio)
 
 
 def with_clock(t_ns: Times, polarity: Polarities, ratio: float) -> Events:
@@ -107,8 +107,10 @@ def drift_warp(t_ns: Times, swing: float, within_s: float = 1.0) -> Warp:
     steps = math.ceil((end - begin) / step_ns) + 1
     middle_s = (np.arange(steps) + 0.5) * step_ns / NS_PER_S
     lengths_ns = step_ns / (1.0 + swing * np.sin(math.pi * middle_s / within_s))
-    before_ns = begin + step_ns * np.arange(steps + 1)
-    return Warp(before_ns, begin + np.concatenate(([0.0], np.cumsum(lengths_ns))))
+    before_ns = begin + step_ns * np.arange(steps + 1, dtype=np.float64)
+    since_ns = np.zeros(steps + 1)
+    np.cumsum(lengths_ns, out=since_ns[1:])
+    return Warp(before_ns, begin + since_ns)
 
 
 def with_drifting_clock(t_ns: Times, polarity: Polarities, swing: float, within_s: float = 1.0) -> Events:
