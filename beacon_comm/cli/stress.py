@@ -41,6 +41,7 @@ from beacon_comm.simulation.stress import (
     drift_warp,
     from_another_time,
     jitter_warp,
+    looped,
     thinned,
     with_background,
     with_fading,
@@ -89,7 +90,7 @@ STRESSES = (
         'drift',
         'Clock drifting',
         "The sender's bit rate swings like a sine, to either side by this share; from slowest to fastest within 1 s.",
-        'swing of the bit rate to either side (%)',
+        'swing of the bit rate (± %)',
         '%',
         (0.0, 0.1, 0.5, 1.0, 2.0),
         0.0,
@@ -100,7 +101,7 @@ STRESSES = (
         'Edge jitter',
         'Every edge, with its events, comes early or late by its own normally distributed time; its standard deviation'
         ' is this share of a bit.',
-        'jitter (% of a bit, standard deviation)',
+        'jitter (% of a bit)',
         '%',
         (0.0, 5.0, 10.0, 15.0, 20.0),
         0.0,
@@ -110,7 +111,7 @@ STRESSES = (
         'background',
         'Background events',
         "A Poisson process of this many events for each event of the signal, with the signal's share of ON events.",
-        "background events for each of the signal's",
+        'background events per signal event',
         ': 1',
         (0.0, 0.25, 0.5, 1.0, 2.0),
         0.0,
@@ -142,11 +143,22 @@ STRESSES = (
     Stress(
         'leak',
         'Another beacon leaks in',
-        "This share of a second beacon's events is mixed in; it sends the same text at another bit rate. (At 3125 bps a"
-        ' beacon has about five times the events a second of one at 504 bps.)',
-        "share of the other beacon's events (%)",
+        "This share of a second beacon's events is mixed in; it sends the same text at another bit rate. A beacon at 3125"
+        ' bps has several times the events a second of one at 504 bps: where they come to more than the own ones, a'
+        " receiver that lists both rates may read the other beacon, and what it reads counts as inserted.",
+        "other beacon's events (%)",
         '%',
         (0.0, 10.0, 20.0, 40.0),
+        0.0,
+        20.0,
+    ),
+    Stress(
+        'leak_relative',
+        'Another beacon leaks in, by the own events',
+        "As before, but so many of the second beacon's events that they come to this share of the waveform's own.",
+        'other over own events (%)',
+        '%',
+        (0.0, 5.0, 10.0, 20.0),
         0.0,
         20.0,
     ),
@@ -154,7 +166,7 @@ STRESSES = (
         'leak_same',
         'A beacon of the same bit rate leaks in',
         "This share of a second beacon's events is mixed in: the same waveform, begun in its middle.",
-        "share of the other beacon's events (%)",
+        "other beacon's events (%)",
         '%',
         (0.0, 10.0, 20.0, 40.0),
         0.0,
@@ -487,6 +499,12 @@ def _leak(severity: float, waveform: Waveform, other: Events) -> Stressed:
     return Stressed(*with_leak(waveform.t_ns, waveform.polarity, *other, severity / 100.0, SEED))
 
 
+def _leak_relative(severity: float, waveform: Waveform, other: Events) -> Stressed:
+    begin_ns, end_ns = int(waveform.t_ns[0]), int(waveform.t_ns[-1])
+    whole = len(looped(*other, begin_ns, end_ns)[0])
+    return _leak(min(100.0, severity * len(waveform.t_ns) / whole), waveform, other)
+
+
 def _leak_same(severity: float, waveform: Waveform, _: Events) -> Stressed:
     return _leak(severity, waveform, from_another_time(waveform.t_ns, waveform.polarity))
 
@@ -504,5 +522,6 @@ APPLIED: dict[str, Callable[[float, Waveform, Events], Stressed]] = {
     'gaps': _gaps,
     'fading': _fading,
     'leak': _leak,
+    'leak_relative': _leak_relative,
     'leak_same': _leak_same,
 }

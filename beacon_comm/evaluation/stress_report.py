@@ -252,7 +252,8 @@ figures)."""
 CELLS = """In the tables below a cell is **wrong** (missing, inserted; wrong with status ok; repaired)."""
 
 UNTOUCHED = """Of the characters that no gap touched (a gap in one of its 11 bits, or in the half bit before or after): wrong
-or missing ones, and what was inserted anywhere inside the sendings."""
+or missing ones, and what was inserted anywhere inside the sendings. In the figure, the broken line is the share of the
+characters that a gap touched."""
 
 
 def _waveforms_table(results: StressResults) -> str:
@@ -357,7 +358,7 @@ def stress_figure(results: StressResults, stress: Stress) -> Figure:
     for panel in panels[len(results.waveforms) :]:
         panel.set_axis_off()
     handles, labels = panels[0].get_legend_handles_labels()
-    panels[len(results.waveforms)].legend(handles, labels, loc='center', frameon=False, title='receiver')
+    panels[len(results.waveforms)].legend(handles, labels, loc='center', frameon=False)
     figure.suptitle(stress.title, x=0.01, ha='left')
     return figure
 
@@ -385,6 +386,13 @@ def _draw_panel(panel: Axes, results: StressResults, stress: Stress, waveform: s
             clip_on=False,
             zorder=3 + place,
         )
+    touched = [
+        (count.severity, 1.0 - count.untouched / count.characters)
+        for count in results.curve(stress.name, waveform, results.receivers[0])
+        if count.untouched is not None
+    ]
+    if touched:
+        panel.plot(*zip(*touched, strict=True), '--', color='0.45', linewidth=1.0, label='touched by a gap', zorder=2)
     if stress.logarithmic:
         if min(stress.severities) > 0.0:
             panel.set_xscale('log')
