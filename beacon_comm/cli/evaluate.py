@@ -173,8 +173,10 @@ def _command(arguments: argparse.Namespace) -> str:
     options = {'truth': '--truth', 'receiver': '--receiver', 'bit_rate': '--bit-rate', 'params': '--params'}
     options |= {'stress_only': '--stress-only', 'stress_simulated': '--stress-simulated'}
     for name, option in options.items():
-        if getattr(arguments, name) is not None:
-            words += [option, shlex.quote(getattr(arguments, name))]
+        value = getattr(arguments, name)
+        if value is not None:
+            is_file = name in ('truth', 'params') and os.path.isfile(value)
+            words += [option, f'…/{Path(value).name}' if is_file else shlex.quote(value)]
     for setting in arguments.set:
         words += ['--set', shlex.quote(setting)]
     return ' '.join([*words, '--stress', Path(arguments.stress).name or '.'])

@@ -303,7 +303,7 @@ def recorded(path: str, truth: str, parameters: Parameters) -> Waveform:
     if not len(t_ns):
         raise RecordingError(f'{path}: no events')
     t_ns = t_ns - t_ns[0]
-    reference = replace(parameters, receiver=REFERENCE)
+    reference = _all_receivers(parameters, parameters.bit_rates)[REFERENCE]
     characters = receive_signal(t_ns, polarity, reference).characters
     frame = CharacterFrame.from_parameters(parameters)
     sent = score(characters, truth, (0, int(t_ns[-1])), Signal(t_ns, polarity), frame)
@@ -338,15 +338,19 @@ def receivers_for(
     listed = parameters.bit_rates
     if not any(abs(rate / waveform.bit_rate_bps - 1.0) < SAME_RATE for rate in listed):
         listed = tuple(sorted((*listed, waveform.bit_rate_bps)))
-    values: dict[str, Any] = {f.name: getattr(parameters, f.name) for f in fields(Parameters)}
-    for name in ('receiver', 'blind'):
-        values.pop(name, None)
-    found = declared_receivers(**{**values, 'bit_rates': listed})
+    found = _all_receivers(parameters, listed)
     for name in names or ():
         if name not in found:
             raise ParameterError(f'receiver {name}: must be some of {", ".join(found)}')
     ordered = sorted(found.items(), key=lambda entry: entry[0] != REFERENCE)  # the paper's first
     return {name: setting for name, setting in ordered if names is None or name in names}
+
+
+def _all_receivers(parameters: Parameters, listed_bps: tuple[float, ...]) -> dict[str, Parameters]:
+    values: dict[str, Any] = {f.name: getattr(parameters, f.name) for f in fields(Parameters)}
+    for name in ('receiver', 'blind'):
+        values.pop(name, None)
+    return declared_receivers(**{**values, 'bit_rates': listed_bps})
 
 
 def apply(name: str, severity: float, waveform: Waveform, other: Events) -> Stressed:

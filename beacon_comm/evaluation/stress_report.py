@@ -427,6 +427,6 @@ def _spread(stress: Stress) -> list[float]:
     low, high = place(min(stress.severities)), place(max(stress.severities))
     ticks: list[float] = []
     for severity in sorted(stress.severities, reverse=stress.none == max(stress.severities)):
-        if not ticks or abs(place(severity) - place(ticks[-1])) >= 0.07 * (high - low):
+        if not ticks or abs(place(severity) - place(ticks[-1])) >= 0.13 * (high - low):
             ticks.append(severity)
     return ticks
