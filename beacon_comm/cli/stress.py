@@ -111,7 +111,7 @@ STRESSES = (
         'background',
         'Background events',
         "A Poisson process of this many events for each event of the signal, with the signal's share of ON events.",
-        'background events per signal event',
+        'background per signal event',
         ': 1',
         (0.0, 0.25, 0.5, 1.0, 2.0),
         0.0,
