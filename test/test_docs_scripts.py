@@ -1,0 +1,92 @@
+"""The scripts in ``docs/`` that measure receivers: their parts on small cases, without a timing assertion."""
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from beacon_comm.core.parameters import Parameters
+
+DOCS = Path(__file__).resolve().parents[1] / 'docs'
+THRESHOLD = Parameters(receiver='threshold', bit_rates=(504.0, 1000.0, 3125.0))
+
+
+def load(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, DOCS / f'{name}.py')
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+benchmark = load('benchmark_demodulators')
+reliability = load('reliability')
+
+
+@pytest.mark.parametrize('packet_ns', [None, 7, 10, 1000])
+def test_packets_hold_every_event_once(packet_ns: int | None) -> None:
+    t_ns = np.array([5, 5, 9, 25, 26, 60], np.int64)
+    polarity = np.array([1, -1, 1, -1, 1, -1], np.int8)
+    packets = benchmark.packets((t_ns, polarity), packet_ns, start=1)
+    assert np.concatenate([packet[0] for packet in packets]).tolist() == t_ns[1:].tolist()
+    assert np.concatenate([packet[1] for packet in packets]).tolist() == polarity[1:].tolist()
+    begin_ns = 0
+    for times, _, end_ns in packets:
+        assert np.all((times >= begin_ns) & (times < end_ns))
+        begin_ns = end_ns
+    assert begin_ns == 61
+
+
+def test_a_run_of_the_benchmark_gives_every_character() -> None:
+    waveform = reliability.simulated(3125.0, np.random.default_rng(1))
+    for packet_ns in (10_000_000, None):
+        timing = benchmark.run((waveform.t_ns, waveform.polarity), THRESHOLD, packet_ns)
+        assert timing.included_events == len(waveform.t_ns) > timing.excluded_events > 0
+        assert 0.0 < timing.lock_s < 0.5
+        assert abs(timing.characters - len(reliability.CODES)) < 5
+
+
+@pytest.mark.parametrize('stress', list(reliability.STRESSES))
+def test_what_was_sent_stays_known_under_every_stress(stress: str) -> None:
+    random = np.random.default_rng(2)
+    waveform = reliability.simulated(3125.0, random)
+    stressed = reliability.STRESSES[stress](waveform, random)
+    (due,) = stressed.sendings
+    assert due.codes is reliability.CODES
+    assert np.all(np.diff(due.t_ns) > 0)
+    assert abs(int(stressed.t_ns[0]) - int(due.t_ns[0]) + 100_000_000) < 20_000_000  # 0.1 s of idle line before
+
+
+def test_a_clock_that_is_off_is_judged_by_its_own_time() -> None:
+    job = reliability.Job('simulated, 3125 bps', 'clock up to 2 % off', 1, {'threshold': THRESHOLD})
+    found, _ = job.run()
+    assert len(found) > 500
+    assert found.right.mean() > 0.9
+
+
+def test_the_page_counts_characters_and_errors() -> None:
+    count = 40
+    found = reliability.Judged(
+        np.linspace(0.5, 1.0, count),
+        np.arange(count) % 4 > 0,
+        np.zeros(count, np.int8),
+        np.full(count, 'threshold'),
+        np.full(count, 'clock drifting'),
+        np.full(count, 'simulated, 504 bps'),
+        np.arange(count) % 3,
+    )
+    page = reliability.page({'threshold': found}, 7, ['simulated, 504 bps'], ['--write'], True)
+    assert '| threshold | 40 | 10 | 75.00 % | 75.00 % |' in page
+    assert '| OK | 40 | 10 |' in page and '| clock drifting | 40 | 10 |' in page
+    assert '7 outside every sending' in page
+
+
+@pytest.mark.parametrize(
+    ('share', 'text'), [(0.0, '0.00 %'), (0.5, '50.00 %'), (0.99995, '99.9950 %'), (1.0, '100.00 %')]
+)
+def test_percent_shows_what_is_missing_to_one(share: float, text: str) -> None:
+    assert reliability.percent(share) == text
