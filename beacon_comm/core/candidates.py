@@ -193,6 +193,11 @@ class CandidateSlots:
         slot = self._slots.get(track_id)
         return None if slot is None else slot.demodulator.bit_rate_bps
 
+    def bit_rate_std_bps(self, track_id: int) -> float | None:
+        """Return the standard deviation of that bit rate (bit/s), None where it is not estimated."""
+        slot = self._slots.get(track_id)
+        return None if slot is None else slot.demodulator.bit_rate_std_bps
+
     def confirmed_at_ns(self, track_id: int) -> int | None:
         """Return the end of the character that confirmed a track (ns), None if it is not confirmed."""
         slot = self._slots.get(track_id)
@@ -216,11 +221,12 @@ class CandidateSlots:
         )
 
     def _end_turns_that_are_over(self, t_ns: int, wanted: int) -> None:
-        """Free up to ``wanted`` slots of candidates past ``turn_characters``, most characters first."""
+        """Free up to ``wanted`` slots of candidates past ``turn_characters`` or given up, most characters first."""
         over = [
             (-slot.record.characters, track_id)
             for track_id, slot in self._slots.items()
-            if not slot.record.confirmed and slot.record.characters >= self._p.turn_characters
+            if not slot.record.confirmed
+            and (slot.record.characters >= self._p.turn_characters or slot.demodulator.given_up)
         ]
         for _, track_id in sorted(over)[: max(wanted, 0)]:
             self._end_turn(track_id, t_ns)

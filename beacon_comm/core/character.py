@@ -27,9 +27,12 @@ class Character:
         t_ns: time of the leading edge of its start bit (ns, sensor clock).
         code: value of the data bits (0 to 127 with 7 data bits).
         status: see :class:`Status`.
-        confidence: 0 to 1; how far the worst bit was from being decided otherwise.
+        confidence: 0 to 1.  Sequence receiver: the probability that the code is right, calibrated; threshold receiver: how
+            far the worst bit was from being decided otherwise.
         frame: all bits of the frame as received, first sent bit most significant (11 bits: 0 d6…d0 p 1 1).
         bit_rate_bps: rate at which it was decoded (bit/s).
+        bit_llr: log-likelihood ratio of each bit of the frame without the frame's structure (nat, positive: 1), in the
+            order they are sent; empty from the threshold receiver.
     """
 
     t_ns: int
@@ -38,3 +41,4 @@ class Character:
     confidence: float
     frame: int
     bit_rate_bps: float
+    bit_llr: tuple[float, ...] = ()

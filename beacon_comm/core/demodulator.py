@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from beacon_comm.core.character import Character
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.rate_bank import RateBank
+from beacon_comm.core.sequence import SequenceDemodulator
 from beacon_comm.core.threshold import ThresholdDemodulator
 
-__all__ = ['Demodulator', 'RateBank', 'ThresholdDemodulator', 'make_demodulator']
+__all__ = ['Demodulator', 'RateBank', 'SequenceDemodulator', 'ThresholdDemodulator', 'make_demodulator']
 
 
 class Demodulator(Protocol):
@@ -37,9 +38,21 @@ class Demodulator(Protocol):
         """The settled bit rate (bit/s), None before."""
         ...
 
+    @property
+    def bit_rate_std_bps(self) -> float | None:
+        """Standard deviation of the settled bit rate (bit/s), None before, or where the rate is not estimated."""
+        ...
+
+    @property
+    def given_up(self) -> bool:
+        """Whether it has looked long enough to say that there is no beacon; it goes on looking all the same."""
+        ...
+
 
 def make_demodulator(parameters: Parameters) -> Demodulator:
-    """Return a new demodulator for a candidate slot: for one listed rate that rate's, for several a bank."""
+    """Return a new demodulator for a candidate slot: the sequence receiver, or the paper's: a bank for several rates."""
+    if parameters.receiver == 'sequence':
+        return SequenceDemodulator(parameters)
     if len(parameters.bit_rates) == 1:
         return ThresholdDemodulator(parameters.bit_rates[0], parameters)
     return RateBank(parameters)

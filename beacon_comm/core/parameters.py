@@ -140,9 +140,18 @@ class Parameters(Declared):
     """Parameters of the receiver."""
 
     # Demodulation
-    receiver: str = parameter('threshold', 'demodulator of the candidate slots', choices=('threshold',))
+    receiver: str = parameter(
+        'sequence',
+        "demodulator of the candidate slots: sequence detection, or threshold, the paper's",
+        choices=('sequence', 'threshold'),
+    )
     bit_rates: tuple[float, ...] = parameter(
         (504.0, 3125.0), 'bit rates to try; the one that explains most of the signal is kept', 'bps', 20.0, 10_000.0
+    )
+    rate_search: str = parameter(
+        'both',
+        'sequence: look for the listed bit rates, for any from 100 bps to 10 kbps (blind), or first for the listed ones',
+        choices=('both', 'listed', 'blind'),
     )
     cutoff_per_bit: float = parameter(
         2.0 * math.pi / 3.0,

@@ -150,6 +150,16 @@ class RateBank:
         """The settled bit rate (bit/s), None before."""
         return None if self._settled is None else self._settled.bit_rate_bps
 
+    @property
+    def bit_rate_std_bps(self) -> float | None:
+        """None: the rates are given, not estimated."""
+        return None
+
+    @property
+    def given_up(self) -> bool:
+        """False: it decides nothing, the parity record does."""
+        return False
+
     def push(self, t_ns: NDArray[np.int64], polarity: NDArray[np.int8], t_end_ns: int) -> list[Character]:
         """Take the next events; see :class:`beacon_comm.core.demodulator.Demodulator`."""
         if self._settled is not None:

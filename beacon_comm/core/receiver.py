@@ -47,6 +47,7 @@ class BeaconSnapshot:
         extent_px: radius of the blob (px).
         index: the paper's index I, mean over the blob's pixels.
         bit_rate_bps: settled bit rate (bit/s), None before.
+        bit_rate_std_bps: its standard deviation (bit/s), None where it is not estimated.
         confirmed_at_ns: end of the character that confirmed it (ns, sensor clock), None if it is not confirmed.
         characters, characters_ok, parity_errors, framing_errors: counted since the slot was given.
         bearing: unit vector in the optical frame, ``(3,)`` float64, None without calibration.
@@ -65,6 +66,7 @@ class BeaconSnapshot:
     extent_px: float
     index: float
     bit_rate_bps: float | None
+    bit_rate_std_bps: float | None
     confirmed_at_ns: int | None
     characters: int
     characters_ok: int
@@ -241,6 +243,7 @@ class Receiver:
             extent_px=track.extent_px,
             index=track.index,
             bit_rate_bps=self._slots.bit_rate_bps(track.track_id),
+            bit_rate_std_bps=self._slots.bit_rate_std_bps(track.track_id),
             confirmed_at_ns=self._slots.confirmed_at_ns(track.track_id),
             characters=0 if record is None else record.characters,
             characters_ok=0 if record is None else record.ok,

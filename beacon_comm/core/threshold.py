@@ -99,6 +99,16 @@ class ThresholdDemodulator:
         """The one bit rate (bit/s)."""
         return self._bit_rate_bps
 
+    @property
+    def bit_rate_std_bps(self) -> float | None:
+        """None: the rate is given, not estimated."""
+        return None
+
+    @property
+    def given_up(self) -> bool:
+        """False: it decides nothing, the parity record does."""
+        return False
+
     def push(self, t_ns: NDArray[np.int64], polarity: NDArray[np.int8], t_end_ns: int) -> list[Character]:
         """Take the next events; see :class:`beacon_comm.core.demodulator.Demodulator`."""
         return self._given.take(self.push_readings(t_ns, polarity, t_end_ns))

@@ -16,15 +16,9 @@ def declared_receivers(**parameters: Any) -> dict[str, Parameters]:
     Raises:
         ParameterError: a refused value.
     """
-    declared = {declaration.name: declaration for declaration in declarations(Parameters)}
-    found = {name: Parameters(**{'receiver': name, **parameters}) for name in declared['receiver'].choices}
-    if 'blind' in declared:
-        usual = {name: Parameters(**{'blind': False, 'receiver': name, **parameters}) for name in found}
-        # The paper's receiver has to be told the rate.
-        blind = {
-            f'{name}, blind': Parameters(**{'receiver': name, **parameters, 'blind': True})
-            for name in found
-            if name != 'threshold'
-        }
-        return usual | blind
+    found: dict[str, Parameters] = {}
+    for receiver in next(d for d in declarations(Parameters) if d.name == 'receiver').choices:
+        found[receiver] = Parameters(**{'receiver': receiver, 'rate_search': 'listed', **parameters})
+        if receiver != 'threshold':  # the paper's receiver has to be told the rate
+            found[f'{receiver}, blind'] = Parameters(**{'receiver': receiver, **parameters, 'rate_search': 'blind'})
     return found

@@ -61,6 +61,7 @@ def _character_message(stamped: StampedCharacter) -> Character:
         stamp=time_message(stamped.at.ros_ns),
         sensor_time_ns=stamped.at.sensor_ns,
         bit_rate_bps=_float32(character.bit_rate_bps),
+        bit_llr=[_float32(ratio) for ratio in character.bit_llr],
     )
 
 
@@ -99,6 +100,7 @@ def _beacon_message(beacon: BeaconSnapshot) -> Beacon:
         extent_px=_float32(beacon.extent_px),
         index=_float32(beacon.index),
         bit_rate_bps=NAN if beacon.bit_rate_bps is None else _float32(beacon.bit_rate_bps),
+        bit_rate_std_bps=NAN if beacon.bit_rate_std_bps is None else _float32(beacon.bit_rate_std_bps),
         characters=beacon.characters,
         characters_ok=beacon.characters_ok,
         parity_errors=beacon.parity_errors,

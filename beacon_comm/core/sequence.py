@@ -1,0 +1,301 @@
+"""The sequence demodulator: blind, soft and streaming; reads what a threshold throws away.
+
+::
+
+    searching   events ─► buffer ─► attempts on a grid of event time: rate, phase, histograms ─┐
+                            ▲                                                                   │ a lock
+                            └────────── too many words in doubt ────────┐                       ▼
+    locked      events ─► bit clock ─► counts ─► free and framed trellis ─► words ─► characters
+
+A lock is followed from the buffer's beginning on, so that what was said before it is not lost.  Everything happens at
+times of the stream, whatever the batches: an attempt sees the events before its time, a word is decided at a bit.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beacon_comm.core.acquisition import Lock, acquire
+from beacon_comm.core.bit_clock import BORDER, P_PERIOD, PERIOD
+from beacon_comm.core.character import Character, Status
+from beacon_comm.core.events import NS_PER_S
+from beacon_comm.core.framing import CharacterFrame
+from beacon_comm.core.likelihood import MEMORY_BITS, compression_table
+from beacon_comm.core.parameters import Parameters
+from beacon_comm.core.rate_search import READ_BACK_CHARACTERS, RateSearch, make_searches
+from beacon_comm.core.sequence_detection import (
+    BORDER_OF_START,
+    FIRST_RATIO,
+    FULL,
+    KIND,
+    KIND_NOISE,
+    KIND_REPAIRED,
+    KIND_UNREADABLE,
+    LOST,
+    MARGIN,
+    PERIOD_THEN,
+    STILL_LOCKED,
+    WORD,
+    detect,
+    end_detection,
+    start_at,
+)
+from beacon_comm.core.soft_decision import confidence_of, frame_layout
+from beacon_comm.core.trellis import framed_transitions
+
+REFINED_AFTER = 25
+"""Phase and histograms of a lock are learnt anew once over so many characters: a lock begins with a handful."""
+
+REFINED_PERIODS: NDArray[np.float64] = 1.0 + 0.001 * np.arange(-8.0, 9.0)
+"""Periods that a refinement looks at, as shares of the clock's."""
+
+_ROWS = 512
+
+
+class SequenceDemodulator:
+    """Demodulates one beacon; see the module.
+
+    Args:
+        parameters: the rates to look for, the character frame and the bound of the buffer.
+    """
+
+    def __init__(self, parameters: Parameters) -> None:
+        self._frame = CharacterFrame.from_parameters(parameters)
+        self._transitions = framed_transitions(self._frame)
+        self._layout = frame_layout(self._frame)
+        self._decode = self._frame.decoding_table()
+        self._compression = compression_table()
+        self._searches: list[RateSearch] = make_searches(parameters, self._frame)
+        self._most_events = parameters.buffer_max_bytes // 9
+        self._rows = np.zeros((_ROWS, FIRST_RATIO + self._frame.length))
+        self._lock: Lock | None = None
+        self._origin_ns: int | None = None
+        self._t = np.empty(0, np.float64)
+        self._polarity = np.empty(0, np.int8)
+        self._taken = 0  # events of the buffer that the lock has seen
+        self._given_to = -math.inf  # end of the last character that was given out
+        self._refine_at = math.inf  # time at which the lock is to be refined
+        self._usable_from = -math.inf  # events before this are not read again
+
+    @property
+    def bit_rate_bps(self) -> float | None:
+        """The bit rate of the present lock (bit/s), None without one."""
+        return None if self._lock is None else NS_PER_S / float(self._lock.clock.values[PERIOD])
+
+    @property
+    def bit_rate_std_bps(self) -> float | None:
+        """Standard deviation of :attr:`bit_rate_bps` (bit/s), None without a lock."""
+        if self._lock is None:
+            return None
+        values = self._lock.clock.values
+        return math.sqrt(float(values[P_PERIOD])) * NS_PER_S / float(values[PERIOD])
+
+    @property
+    def given_up(self) -> bool:
+        """Whether every rate has been looked for long enough in vain."""
+        return self._lock is None and all(search.exhausted for search in self._searches)
+
+    def push(self, t_ns: NDArray[np.int64], polarity: NDArray[np.int8], t_end_ns: int) -> list[Character]:
+        """Take the next events; see :class:`beacon_comm.core.demodulator.Demodulator`."""
+        if self._origin_ns is None:
+            if not len(t_ns):
+                return []
+            self._origin_ns = int(t_ns[0])
+            self._restart(0.0)
+        self._t = np.concatenate((self._t, (t_ns - self._origin_ns).astype(np.float64)))
+        self._polarity = np.concatenate((self._polarity, polarity))
+        t_end = float(t_end_ns - self._origin_ns)
+        characters: list[Character] = []
+        while True:
+            if self._lock is not None:
+                status, found = self._follow(self._lock, t_end)
+                characters += found
+                if status == LOST:
+                    self._unlock()
+                elif status != FULL:
+                    break
+            elif not self._attempt(t_end):
+                break
+        self._forget(t_end)
+        return characters
+
+    def flush(self) -> list[Character]:
+        """End the stream; see :class:`beacon_comm.core.demodulator.Demodulator`."""
+        if self._lock is None:
+            return []
+        lock = self._lock
+        count = end_detection(lock.clock, lock.detection, self._transitions, self._layout, self._rows)
+        characters = self._characters(self._rows[:count])
+        self._unlock()
+        return characters
+
+    # Locked
+
+    def _follow(self, lock: Lock, t_end: float) -> tuple[int, list[Character]]:
+        """Take events up to ``t_end``; return whether the lock holds, and the characters."""
+        rows = self._rows
+        refining = self._refine_at <= t_end
+        until = min(t_end, self._refine_at)
+        stop = int(np.searchsorted(self._t, until)) if refining else len(self._t)
+        count, taken, status = detect(
+            lock.clock,
+            lock.detection,
+            self._transitions,
+            self._layout,
+            lock.inverted,
+            self._t[self._taken : stop],
+            self._polarity[self._taken : stop],
+            until,
+            rows,
+        )
+        self._taken += taken
+        characters = self._characters(rows[:count])
+        if refining and status == STILL_LOCKED:
+            self._refine(lock, stop)
+            status = FULL
+        return status, characters
+
+    def _refine(self, lock: Lock, stop: int) -> None:
+        """Learn phase and histograms anew from what came since the lock, and go on from the last character."""
+        period = float(lock.clock.values[PERIOD])
+        first = int(np.searchsorted(self._t, self._refine_at - REFINED_AFTER * self._frame.length * period))
+        self._refine_at = math.inf
+        window = slice(first, stop)
+        better = self._acquire(window, period * REFINED_PERIODS, REFINED_AFTER // 2)
+        if better is not None and better.inverted == lock.inverted:
+            self._begin(better, max(self._given_to - 2.0 * self._frame.length * period, float(self._t[first])))
+
+    def _unlock(self) -> None:
+        assert self._lock is not None
+        lost_at = float(self._lock.clock.values[BORDER])
+        self._usable_from = max(self._given_to, lost_at - self._read_back(self._lock))
+        self._lock = None
+        self._refine_at = math.inf
+        self._taken = 0
+        self._restart(lost_at)
+
+    def _restart(self, t: float) -> None:
+        for search in self._searches:
+            search.restart(t)
+
+    def _characters(self, rows: NDArray[np.float64]) -> list[Character]:
+        characters = []
+        for row in rows:
+            character = self._character(row)
+            if character is not None:
+                characters.append(character)
+        return characters
+
+    def _character(self, row: NDArray[np.float64]) -> Character | None:
+        """Return the character of a row, None if it is not to be given out."""
+        word, kind, period, start = int(row[WORD]), row[KIND], float(row[PERIOD_THEN]), float(row[BORDER_OF_START])
+        if kind == KIND_UNREADABLE or start < self._given_to - 0.5 * period:
+            return None
+        self._given_to = start + self._frame.length * period
+        code, status = self._decode[word]
+        if kind == KIND_REPAIRED:
+            status = Status.REPAIRED
+        elif kind == KIND_NOISE and status is Status.OK:
+            status = Status.FRAMING_ERROR
+        return Character(
+            t_ns=(self._origin_ns or 0) + round(start),
+            code=code,
+            status=status,
+            confidence=0.0 if kind == KIND_NOISE else confidence_of(float(row[MARGIN])),
+            frame=word,
+            bit_rate_bps=NS_PER_S / period,
+            bit_llr=tuple(row[FIRST_RATIO:].tolist()),
+        )
+
+    # Searching
+
+    def _attempt(self, t_end: float) -> bool:
+        """Make the attempt that is due next, if its time has come; return whether one was made."""
+        search = min(self._searches, key=lambda search: search.due)
+        now = search.due
+        if not now <= t_end:
+            return False
+        stop = int(np.searchsorted(self._t, now))
+        first = max(int(np.searchsorted(self._t, self._usable_from)), stop - self._most_events)
+        window = search.window(self._t, now, first, stop)
+        if window is None:  # nothing there: wait for the next event
+            search.restart(float(self._t[stop]) if stop < len(self._t) else math.inf)
+            return True
+        lock = self._choose(search, now, first, stop, self._look(search, window))
+        search.failed()
+        if lock is not None:
+            self._start(lock, first)
+        return True
+
+    def _look(self, search: RateSearch, window: slice) -> Lock | None:
+        t, polarity = self._t[window], self._polarity[window]
+        for periods in search.periods(t, polarity):
+            lock = self._acquire(window, periods, search.needed)
+            if lock is not None:
+                return lock
+        return None
+
+    def _acquire(self, window: slice, periods: NDArray[np.float64], needed: int) -> Lock | None:
+        return acquire(
+            self._t[window], self._polarity[window], periods, self._transitions, self._compression, needed
+        )
+
+    def _choose(self, found: RateSearch, now: float, first: int, stop: int, lock: Lock | None) -> Lock | None:
+        """Return the lock to follow.
+
+        A fast rate finds short frames in one character of a slow signal, with idle line between them: where the words
+        leave much of the time unexplained, the slower searches are asked first.
+        """
+        slower = [search for search in self._searches if search.period > found.period]
+        if lock is None or not slower or lock.verdict.full:
+            return lock
+        if not all(search.had_a_chance(now) for search in slower):
+            return None
+        windows = [search.window(self._t, now, first, stop) for search in slower]
+        others = [self._look(search, w) for search, w in zip(slower, windows, strict=True) if w is not None]
+        return max([lock, *(other for other in others if other is not None)], key=lambda lock: lock.verdict.merit)
+
+    def _start(self, lock: Lock, first: int) -> None:
+        """Follow a lock from the buffer's beginning on."""
+        border = float(lock.clock.values[BORDER])
+        self._refine_at = border + REFINED_AFTER * self._frame.length * lock.period
+        if len(lock.positions) > (REFINED_AFTER - 5) * self._frame.length:
+            self._refine_at = math.inf
+        self._begin(lock, max(float(self._t[first]), border - self._read_back(lock)))
+
+    def _begin(self, lock: Lock, t: float) -> None:
+        """Follow a lock from about the time ``t`` (ns) on."""
+        length = self._frame.length
+        values = lock.clock.values
+        bits = math.floor((t - values[BORDER]) / lock.period) - (MEMORY_BITS - 1)
+        values[BORDER] += bits * lock.period
+        positions = lock.positions
+        at = min(max(bits, 0), len(positions) - 1)
+        framed = np.flatnonzero(positions[at:] < length)
+        place = length
+        if len(framed):
+            at += int(framed[0])
+            place = (int(positions[at]) + bits - at) % length
+        start_at(lock.detection, place, length)
+        self._taken = int(np.searchsorted(self._t, values[BORDER]))
+        self._lock = lock
+
+    def _forget(self, t_end: float) -> None:
+        """Drop the events that nothing can need any more."""
+        if self._lock is not None:
+            needed_from = max(self._given_to, t_end - self._read_back(self._lock))
+            if self._refine_at < math.inf:
+                needed_from = min(needed_from, self._refine_at - 2.0 * REFINED_AFTER * self._frame.length * self._lock.period)
+            first = min(self._taken, int(np.searchsorted(self._t, needed_from)))
+        else:
+            needed_from = t_end - max(search.longest for search in self._searches)
+            first = max(int(np.searchsorted(self._t, needed_from)), len(self._t) - self._most_events)
+        if first > len(self._t) // 2:
+            self._t, self._polarity = self._t[first:].copy(), self._polarity[first:].copy()
+            self._taken -= first
+
+    def _read_back(self, lock: Lock) -> float:
+        return READ_BACK_CHARACTERS * self._frame.length * lock.period

@@ -1,0 +1,410 @@
+"""The locked part of the sequence receiver: events in, decided words out, bit by bit and with a bounded delay.
+
+::
+
+    events ─► bit clock ─► counts ─► log p(counts | last 3 bits) ─┬─► free trellis ───┬─► word ─► soft decision
+                 ▲                        ▲                       └─► framed trellis ─┘             │
+                 └── frozen or not ───────┴── histograms, gain ◄────── words that are ok ◄──────────┘
+
+A word is decided two frames after its end (22 bits): by then every path that survives shares it, and a slip of the
+frame has shown itself.  With it the paths that disagree are dropped, so that what follows fits what was said.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from beacon_comm.core.bit_clock import (
+    BORDER,
+    FROZEN,
+    PERIOD,
+    go_on,
+    take_events,
+)
+from beacon_comm.core.likelihood import CONTEXTS, COUNTS, LEVELS, MEMORY_BITS, learn, logarithms, weigh
+from beacon_comm.core.soft_decision import bit_ratios, margins
+from beacon_comm.core.trellis import NOISE_COST, UNLIKELY, framed_step, free_step
+
+DELAY_FRAMES = 2
+"""A word is decided so many frames after its end."""
+
+OK_FRAME_MARGIN = 6.0
+"""A frame margin (nat) from which on a word is ok although the free bits differ …"""
+
+OK_MARGIN = 8.0
+"""… or a bit of it is an erasure; and in any case it has to beat every other word and path by this (nat)."""
+
+READABLE_MARGIN = 3.0
+"""A word with an erased bit that beats the next one by less (nat) is not given out: it would be invented."""
+
+MOST_MARGIN = 100.0
+"""Margins are not told beyond this (nat)."""
+
+LEARNING_MARGIN = 8.0
+"""A word margin (nat) from which on a word is learnt from, ok or only repaired: the ok ones alone would bias."""
+
+LEARNING_MEMORY = 300
+"""Words after which what was learnt has faded to 1/e."""
+
+RELEARN_EVERY = 8
+"""The tables are computed anew after so many words (at first after 1, 2, 4)."""
+
+GAIN_SHARE = 0.2
+"""Share of a word's log amplitude that the gain follows."""
+
+SILENT_SHARE = 0.1
+"""A bit with less than this share of a mean bit's events is silent …"""
+
+RARELY_SILENT = 0.02
+"""… and an erasure if no more than this share of the signal's bits is silent.
+
+Where held bits are often silent, silence says that they are held.
+"""
+
+LOST_FRAMES = 15
+"""So many frames more in doubt than ok, and the lock is given up."""
+
+SLEEP_FRAMES = 6
+"""After so many frames without any event nothing is left to decide, and the clock runs on alone."""
+
+UNKNOWN_PLACE_COST = 8.0
+"""Price of beginning at another place in the frame than the lock's (nat)."""
+
+RING = 64
+_RING_MASK = RING - 1
+
+GAIN, SILENCE = range(2)
+
+# Whole numbers of the state.
+BIT, LEARNT, NEXT_TABLES, NOISE_RUN, DOUBT, SILENT_RUN, ASLEEP = range(7)
+
+# What a row of words tells.
+WORD, KIND, BORDER_OF_START, MARGIN, PERIOD_THEN, FIRST_RATIO = range(6)
+KIND_OK, KIND_REPAIRED, KIND_NOISE, KIND_UNREADABLE = range(4)
+STILL_LOCKED, LOST, FULL = range(3)
+
+
+class Detection(NamedTuple):
+    """State of the locked receiver.
+
+    Attributes:
+        histograms, tables: see :mod:`beacon_comm.core.likelihood`, ``(CONTEXTS, COUNTS, LEVELS)`` float64.
+        means: events of a bit for each context, after the gain, ``(CONTEXTS,)`` float64.
+        levels: ``(2,)`` float64: the gain, by which counts are divided before they are compressed, and the share of
+            silent bits in words.
+        compression: see :func:`beacon_comm.core.likelihood.compression_table`.
+        free_metric, free_bits: of the free trellis, ``(CONTEXTS,)`` float64 and uint64 (last 64 bits of the path).
+        metric, bits, ends, noises: of the framed trellis, ``(states,)`` float64 and uint64: the last 64 bits of the
+            best path to the state, and for each of them whether it ended a frame or was noise.
+        likelihoods, counts, totals, borders, silent: of the last ``RING`` bits.
+        numbers: see the constants above, ``(7,)`` int64.
+    """
+
+    histograms: NDArray[np.float64]
+    tables: NDArray[np.float64]
+    means: NDArray[np.float64]
+    levels: NDArray[np.float64]
+    compression: NDArray[np.uint8]
+    free_metric: NDArray[np.float64]
+    free_bits: NDArray[np.int64]
+    metric: NDArray[np.float64]
+    bits: NDArray[np.int64]
+    ends: NDArray[np.int64]
+    noises: NDArray[np.int64]
+    likelihoods: NDArray[np.float64]
+    counts: NDArray[np.uint8]
+    totals: NDArray[np.float64]
+    borders: NDArray[np.float64]
+    silent: NDArray[np.uint8]
+    numbers: NDArray[np.int64]
+
+
+def make_detection(
+    histograms: NDArray[np.float64],
+    means: NDArray[np.float64],
+    gain: float,
+    silence: float,
+    learnt: int,
+    compression: NDArray[np.uint8],
+    states: int,
+) -> Detection:
+    """Return the state at the start of a lock.
+
+    Args:
+        histograms, means: learnt while the lock was sought.
+        gain, silence: see :class:`Detection`.
+        learnt: number of words in the histograms.
+        compression: table of compressed counts.
+        states: of the framed trellis.
+    """
+    tables = np.empty_like(histograms)
+    logarithms(histograms, tables)
+    return Detection(
+        histograms=histograms,
+        tables=tables,
+        means=means,
+        levels=np.array([gain, silence]),
+        compression=compression,
+        free_metric=np.zeros(CONTEXTS),
+        free_bits=np.zeros(CONTEXTS, np.int64),
+        metric=np.zeros(states),
+        bits=np.zeros(states, np.int64),
+        ends=np.zeros(states, np.int64),
+        noises=np.zeros(states, np.int64),
+        likelihoods=np.zeros((RING, CONTEXTS)),
+        counts=np.zeros((RING, COUNTS), np.uint8),
+        totals=np.zeros(RING),
+        borders=np.zeros(RING),
+        silent=np.zeros(RING, np.uint8),
+        numbers=np.array([0, learnt, learnt + 1, 0, 0, 0, 0], np.int64),
+    )
+
+
+def start_at(state: Detection, position: int, length: int) -> None:
+    """Begin with a bit at a place of the frame; ``length`` or above: at none.
+
+    The bit's own likelihood is still to come, so the paths begin one place before.
+    """
+    state.metric[:] = -UNKNOWN_PLACE_COST
+    before = (position - 1) % length if position < length else position
+    state.metric[before * 2 * CONTEXTS : (before + 1) * 2 * CONTEXTS] = 0.0
+
+
+@njit(cache=True, nogil=True)
+def detect(  # type: ignore[no-untyped-def]
+    clock, state, transitions, layout, inverted, t, polarity, t_end, rows
+):
+    """Take events, then the stream's time; write rows of decided words.
+
+    Args:
+        clock, state: changed in place.
+        transitions, layout: of the character frame.
+        inverted: True if the LED is on for 0.
+        t, polarity: events, ns from the origin (float64) and ±1 (int8).
+        t_end: the stream's time (ns from the origin).
+        rows: ``(n, FIRST_RATIO + length)`` float64, to be written.
+
+    Returns:
+        number of rows, number of events taken, and STILL_LOCKED, LOST or FULL (call again with the rest).
+    """
+    values, numbers, length = clock.values, state.numbers, transitions.length
+    clock_numbers, events = clock.numbers, clock.counts
+    sign = -1 if inverted else 1
+    i, count = 0, 0
+    while True:
+        if count + 2 > len(rows):
+            return count, i, FULL
+        if numbers[ASLEEP]:
+            if i == len(t):
+                return count, i, STILL_LOCKED
+            _wake(clock, state, transitions, t[i])
+        border = values[BORDER] + values[PERIOD]
+        i = take_events(values, clock_numbers, events, t, polarity, i, sign)
+        if i == len(t) and t_end < border:
+            return count, i, STILL_LOCKED
+        count = _close_bit(clock, state, transitions, layout, rows, count)
+        go_on(values, events, 1)
+        if numbers[DOUBT] > LOST_FRAMES * length:
+            return count, i, LOST
+        if numbers[SILENT_RUN] > SLEEP_FRAMES * length:
+            numbers[ASLEEP] = 1
+
+
+@njit(cache=True, nogil=True)
+def _wake(clock, state, transitions, t):  # type: ignore[no-untyped-def]
+    """Go on just before an event after a long silence."""
+    values = clock.values
+    skipped = np.floor((t - values[BORDER]) / values[PERIOD]) - 1.0
+    if skipped > 0.0:
+        go_on(values, clock.counts, skipped)
+    clock.numbers[FROZEN] = 0
+    length = transitions.length
+    state.metric[:] = UNLIKELY
+    state.metric[length * 2 * CONTEXTS + CONTEXTS - 1] = 0.0
+    for context in range(CONTEXTS):
+        state.metric[(length + 1) * 2 * CONTEXTS + context] = -0.5 * NOISE_COST
+    state.free_metric[:] = 0.0
+    state.ends[:] = 0
+    state.noises[:] = 0
+    state.numbers[SILENT_RUN] = 0
+    state.numbers[ASLEEP] = 0
+
+
+@njit(cache=True, nogil=True)
+def _close_bit(clock, state, transitions, layout, rows, count):  # type: ignore[no-untyped-def]
+    """Take the present bit, whose events are all there; return the number of rows."""
+    numbers = state.numbers
+    place = numbers[BIT] & _RING_MASK
+    counts, compression, events = state.counts[place], state.compression, clock.counts
+    gain, silence = state.levels
+    per_gain = 1.0 / gain
+    total = 0
+    for c in range(COUNTS):
+        n = events[c]
+        total += n
+        scaled = int(n * per_gain + 0.5)
+        counts[c] = compression[min(scaled, len(compression) - 1)]
+    state.totals[place] = total
+    state.borders[place] = clock.values[BORDER]
+    numbers[SILENT_RUN] = numbers[SILENT_RUN] + 1 if total == 0 else 0
+    likelihoods = state.likelihoods[place]
+    weigh(state.tables, counts, likelihoods)
+    silent = total < SILENT_SHARE * state.means.mean() * gain
+    state.silent[place] = silent
+    if numbers[BIT] < MEMORY_BITS - 1 or (silent and silence < RARELY_SILENT):
+        likelihoods[:] = 0.0  # an erasure, or before the first event
+    _step_free(state, likelihoods)
+    _step_framed(state, transitions, likelihoods)
+    numbers[BIT] += 1
+    best = np.argmax(state.metric)
+    return _decide(clock, state, transitions, layout, best, DELAY_FRAMES * transitions.length, rows, count)
+
+
+@njit(cache=True, nogil=True)
+def _step_free(state, likelihoods):  # type: ignore[no-untyped-def]
+    best = np.empty(CONTEXTS, np.int32)
+    metric, bits = state.free_metric, state.free_bits
+    free_step(metric, best, likelihoods)
+    old = bits.copy()
+    for context in range(CONTEXTS):
+        bits[context] = old[best[context]] << 1 | context & 1
+
+
+@njit(cache=True, nogil=True)
+def _step_framed(state, transitions, likelihoods):  # type: ignore[no-untyped-def]
+    metric, bits, ends, noises = state.metric, state.bits, state.ends, state.noises
+    count = len(metric)
+    fresh, best = np.empty(count), np.empty(count, np.int32)
+    framed_step(transitions.source, transitions.target, transitions.cost, metric, fresh, best, likelihoods)
+    old_bits, old_ends, old_noises = bits.copy(), ends.copy(), noises.copy()
+    end, noise = (transitions.length - 1) * 2 * CONTEXTS, (transitions.length + 1) * 2 * CONTEXTS
+    for to in range(count):
+        source = best[to]
+        if source >= 0:
+            bits[to] = old_bits[source] << 1 | to & 1
+            ends[to] = old_ends[source] << 1
+            noises[to] = old_noises[source] << 1
+    for to in range(end, end + 2 * CONTEXTS):
+        ends[to] |= 1
+    for to in range(noise, noise + 2 * CONTEXTS):
+        noises[to] |= 1
+
+
+@njit(cache=True, nogil=True)
+def _decide(clock, state, transitions, layout, best, lag, rows, count):  # type: ignore[no-untyped-def]
+    """Decide the bit ``lag`` bits back on the path to the state ``best``; return the number of rows."""
+    numbers, length = state.numbers, transitions.length
+    at = numbers[BIT] - 1 - lag
+    if at < 0:
+        return count
+    if state.ends[best] >> lag & 1:
+        numbers[NOISE_RUN] = 0
+        if at >= length + MEMORY_BITS - 2:
+            _decide_word(clock, state, layout, length, best, at, lag, rows[count])
+            count += 1
+    elif state.noises[best] >> lag & 1:
+        clock.numbers[FROZEN] = 1
+        if not state.silent[at & _RING_MASK]:  # silence is not in doubt
+            numbers[NOISE_RUN] += 1
+            numbers[DOUBT] += 1
+            if numbers[NOISE_RUN] == length:
+                numbers[NOISE_RUN] = 0
+                row = rows[count]
+                row[:] = 0.0
+                free = state.free_bits[np.argmax(state.free_metric)] >> lag
+                row[WORD] = free & ((1 << length) - 1)
+                row[KIND] = KIND_NOISE
+                row[BORDER_OF_START] = state.borders[(at - length + 1) & _RING_MASK]
+                row[PERIOD_THEN] = clock.values[PERIOD]
+                count += 1
+    else:
+        numbers[NOISE_RUN] = 0
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _decide_word(clock, state, layout, length, best, at, lag, row):  # type: ignore[no-untyped-def]
+    numbers = state.numbers
+    mask = (1 << length) - 1
+    word = state.bits[best] >> lag & mask
+    free = state.free_bits[np.argmax(state.free_metric)] >> lag & mask
+    before = state.bits[best] >> (lag + length) & (CONTEXTS - 1)
+    # At the end of the stream the bits after the word are not there: ones without evidence stand in for them.
+    following = state.bits[best] << (MEMORY_BITS - 1) | (CONTEXTS // 2 - 1)
+    after = following >> lag & (CONTEXTS // 2 - 1)
+    likelihoods = np.zeros((length + MEMORY_BITS - 1, CONTEXTS))
+    erased = 0
+    for k in range(len(likelihoods)):
+        if at - length + 1 + k < numbers[BIT]:
+            place = (at - length + 1 + k) & _RING_MASK
+            likelihoods[k] = state.likelihoods[place]
+            if k < length:
+                erased += state.silent[place] and state.levels[SILENCE] < RARELY_SILENT
+    frame_margin, word_margin = margins(likelihoods, before, after, word, layout)
+    bit_ratios(likelihoods, before, after, length, row[FIRST_RATIO:])
+    agreeing, other = UNLIKELY, UNLIKELY
+    metric, bits, ends = state.metric, state.bits, state.ends
+    for to in range(len(metric)):
+        if ends[to] >> lag & 1 and bits[to] >> lag & mask == word:
+            agreeing = max(agreeing, metric[to])
+        else:
+            other = max(other, metric[to])
+            metric[to] = UNLIKELY
+    margin = min(word_margin, agreeing - other, MOST_MARGIN)
+    ok = margin >= OK_MARGIN and (frame_margin >= OK_FRAME_MARGIN or (word == free and not erased))
+    if ok:
+        numbers[DOUBT] = max(0, numbers[DOUBT] - length)
+    elif not erased:
+        numbers[DOUBT] += length
+    if ok or word_margin >= LEARNING_MARGIN:
+        _learn_word(state, length, before, word, at)
+    clock.numbers[FROZEN] = 0 if ok else 1
+    row[WORD], row[MARGIN], row[PERIOD_THEN] = word, margin, clock.values[PERIOD]
+    row[KIND] = KIND_OK if ok else KIND_UNREADABLE if erased and margin < READABLE_MARGIN else KIND_REPAIRED
+    row[BORDER_OF_START] = state.borders[(at - length + 1) & _RING_MASK]
+
+
+@njit(cache=True, nogil=True)
+def _learn_word(state, length, before, word, at):  # type: ignore[no-untyped-def]
+    """Learn from a word that is ok, and follow the amplitude."""
+    numbers = state.numbers
+    histograms, counts, means = state.histograms, state.counts, state.means
+    levels, silent, totals = state.levels, state.silent, state.totals
+    fading = 1.0 - 1.0 / LEARNING_MEMORY
+    for c in range(CONTEXTS):
+        for d in range(COUNTS):
+            for level in range(LEVELS):
+                histograms[c, d, level] *= fading
+    seen, expected = 0.0, 0.0
+    context = before
+    for k in range(length):
+        context = (context << 1 | (word >> (length - 1 - k) & 1)) & (CONTEXTS - 1)
+        place = (at - length + 1 + k) & _RING_MASK
+        levels[SILENCE] += (silent[place] - levels[SILENCE]) / (LEARNING_MEMORY * length)
+        if silent[place] and levels[SILENCE] < RARELY_SILENT:
+            continue
+        learn(histograms, counts[place], context, 1.0)
+        total = totals[place] / levels[GAIN]
+        seen += total
+        expected += means[context]
+        means[context] += (total - means[context]) / LEARNING_MEMORY
+    if seen > 0.0 and expected > 0.0:
+        levels[GAIN] *= np.exp(GAIN_SHARE * np.log(seen / expected))
+    numbers[LEARNT] += 1
+    if numbers[LEARNT] >= numbers[NEXT_TABLES]:
+        logarithms(state.histograms, state.tables)
+        numbers[NEXT_TABLES] = numbers[LEARNT] + min(RELEARN_EVERY, max(1, numbers[LEARNT] // 8))
+
+
+@njit(cache=True, nogil=True)
+def end_detection(clock, state, transitions, layout, rows):  # type: ignore[no-untyped-def]
+    """Decide what is still open, as if nothing more came; return the number of rows."""
+    count = 0
+    best = np.argmax(state.metric)
+    for delay in range(DELAY_FRAMES * transitions.length - 1, -1, -1):
+        count = _decide(clock, state, transitions, layout, best, delay, rows, count)
+    return count
