@@ -1,0 +1,228 @@
+"""The bit clock: counts in their sub-slots, and a clock that follows the edges unless it is frozen."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from line_events import line_events
+
+from beacon_comm.core.bit_clock import (
+    BORDER,
+    FROZEN,
+    LATENCY_OFF,
+    LATENCY_ON,
+    P_PERIOD,
+    P_PHASE,
+    PERIOD,
+    PULL,
+    go_on,
+    make_clock,
+    take_events,
+)
+from beacon_comm.core.likelihood import COUNTS, SUB_SLOTS
+
+RATE_BPS = 1000.0
+BIT = 1e6
+
+
+def clock_at(border=0.0, period=BIT, latency=(0.0, 0.0), spread=0.05, period_error=0.003):
+    return make_clock(border, period, latency, spread, period_error)
+
+
+def run(clock, t, polarity, bits, sign=1, first=0):
+    """Take so many bits; return the counts of each, ``(bits, COUNTS)``, their borders, and the next event's index."""
+    counts, borders = [], []
+    for _ in range(bits):
+        borders.append(clock.values[BORDER])
+        first = take_events(clock.values, clock.numbers, clock.counts, t, polarity, first, sign)
+        counts.append(clock.counts.copy())
+        go_on(clock.values, clock.counts, 1)
+    return np.array(counts), np.array(borders), first
+
+
+def random_line(bits, seed=0):
+    return np.random.default_rng(seed).integers(0, 2, bits).astype(np.uint8)
+
+
+def events_of(bits, rate_bps=RATE_BPS, t0_ns=0, **options):
+    t_ns, polarity = line_events(bits, rate_bps, t0_ns, **options)
+    return t_ns.astype(np.float64), polarity
+
+
+def off(clock, rate_bps=RATE_BPS, t0=0.0):
+    """Return how far the clock's border is from the nearest true one (bit)."""
+    bits = (clock.values[BORDER] - t0) * rate_bps / 1e9
+    return bits - round(bits)
+
+
+# --- counting -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('sign', [1, -1])
+def test_counts_land_in_their_sub_slots(sign):
+    t = np.array([0.0, 0.24, 0.25, 0.5, 0.74, 0.75, 0.999, 1.0, 1.3, 2.9]) * BIT
+    polarity = np.array([1, -1, 1, 1, -1, -1, 1, -1, 1, 1], np.int8)
+    clock = clock_at()
+    counts, borders, first = run(clock, t, polarity, 3, sign)
+    expected = [[1, 1, 1, 1, 1, 0, 1, 1], [0, 1, 0, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0, 0, 0]]
+    if sign < 0:
+        expected = [row[SUB_SLOTS:] + row[:SUB_SLOTS] for row in expected]
+    assert counts.tolist() == expected
+    assert first == len(t) and borders.tolist() == [0.0, BIT, 2 * BIT]
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(0, 400), st.floats(-2.0, 2.0))
+def test_every_event_is_counted_once(seed, count, begin):
+    random = np.random.default_rng(seed)
+    t = np.sort(random.random(count)) * 50 * BIT
+    polarity = random.choice(np.array([-1, 1], np.int8), count)
+    counts, _, first = run(clock_at(begin * BIT), t, polarity, 60)
+    # What lies before the first border goes to its bit.
+    assert first == count and counts.sum() == count
+    assert counts[:, :SUB_SLOTS].sum() == np.count_nonzero(polarity > 0)
+    assert counts.shape == (60, COUNTS)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.lists(st.integers(0, 2000), max_size=30), st.sampled_from([1, -1]))
+def test_any_batching_gives_the_same_counts_and_the_same_clock(seed, cuts, sign):
+    t, polarity = events_of(random_line(100, seed), RATE_BPS * 1.001, burst=15, width_bits=0.6)
+    whole, parted = clock_at(), clock_at()
+    expected, _, _ = run(whole, t, polarity, 120, sign)
+    edges = [0, *sorted(min(cut, len(t)) for cut in cuts), len(t)]
+    counts = []
+    for start, stop in zip(edges[:-1], edges[1:], strict=True):
+        first, batch = 0, (t[start:stop], polarity[start:stop])
+        while True:
+            first = take_events(parted.values, parted.numbers, parted.counts, *batch, first, sign)
+            if first == stop - start:
+                break
+            counts.append(parted.counts.copy())
+            go_on(parted.values, parted.counts, 1)
+    rest, _, _ = run(parted, t, polarity, 120 - len(counts), sign, first=len(t))
+    assert np.array_equal(np.concatenate([np.reshape(counts, (-1, COUNTS)), rest]), expected)
+    assert np.array_equal(parted.values, whole.values) and np.array_equal(parted.numbers, whole.numbers)
+
+
+# --- following ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('late', [-0.2, -0.1, 0.1, 0.2])
+def test_a_clock_that_began_beside_the_borders_comes_back(late):
+    t, polarity = events_of(random_line(300))
+    clock = clock_at(border=late * BIT)
+    run(clock, t, polarity, 300)
+    assert abs(off(clock)) < 0.02
+    assert clock.values[PERIOD] == pytest.approx(BIT, rel=2e-4)
+
+
+@pytest.mark.parametrize('wrong', [-0.003, -0.001, 0.0, 0.001, 0.003])
+def test_a_period_that_was_a_little_wrong_is_put_right(wrong):
+    t, polarity = events_of(random_line(400), RATE_BPS * (1.0 + wrong))
+    clock = clock_at()
+    run(clock, t, polarity, 400)
+    assert clock.values[PERIOD] == pytest.approx(BIT / (1.0 + wrong), rel=1e-4)
+    assert abs(off(clock, RATE_BPS * (1.0 + wrong))) < 0.02
+
+
+@pytest.mark.parametrize('by', [-0.02, 0.02])
+def test_a_clock_that_drifts_away_is_followed(by):
+    # The rate goes to 2 % off within 2000 bits.
+    bits = random_line(2500)
+    changes = np.flatnonzero(np.diff(bits.astype(int))) + 1
+    lengths = BIT / (1.0 + by * np.minimum(np.arange(2500) / 2000.0, 1.0))
+    borders = np.concatenate([[0.0], np.cumsum(lengths)])
+    t = (borders[changes][:, None] + np.arange(10) * 5e3).ravel()
+    polarity = np.repeat(np.where(bits[changes] == 1, 1, -1), 10).astype(np.int8)
+    clock = clock_at()
+    _, found, _ = run(clock, t, polarity, 2450)
+    assert np.abs(found - borders[:2450]).max() < 0.1 * BIT
+    assert clock.values[PERIOD] == pytest.approx(BIT / (1.0 + by), rel=5e-4)
+
+
+def test_the_period_does_not_leave_its_bounds():
+    t, polarity = events_of(np.arange(3000) % 2, RATE_BPS * 1.2)
+    clock = clock_at()
+    for _ in range(3000):
+        run(clock, t, polarity, 1, first=int(np.searchsorted(t, clock.values[BORDER])))
+        assert BIT * (1.0 - PULL) <= clock.values[PERIOD] <= BIT * (1.0 + PULL)
+
+
+def test_each_polarity_has_its_own_latency():
+    bits = random_line(2000)
+    t, polarity = events_of(bits, burst=10, width_bits=0.01)
+    t = t + np.where(polarity > 0, 0.20, 0.10) * BIT
+    order = np.argsort(t, kind='stable')
+    clock = clock_at(latency=(0.15 * BIT, 0.15 * BIT))
+    run(clock, t[order], polarity[order], 2000)
+    assert clock.values[LATENCY_ON] - clock.values[LATENCY_OFF] == pytest.approx(0.1 * BIT, abs=0.01 * BIT)
+    assert clock.values[LATENCY_ON] + clock.values[LATENCY_OFF] == pytest.approx(0.3 * BIT)  # their mean is the phase
+    assert abs(off(clock)) < 0.02
+
+
+def test_frozen_it_only_predicts():
+    t, polarity = events_of(random_line(200), RATE_BPS * 1.003, t0_ns=100_000)
+    clock = clock_at()
+    clock.numbers[FROZEN] = 1
+    counts, borders, first = run(clock, t, polarity, 220)
+    assert np.array_equal(borders, BIT * np.arange(220))
+    assert clock.values[PERIOD] == BIT and clock.values[LATENCY_ON] == clock.values[LATENCY_OFF] == 0.0
+    assert counts.sum() == first == len(t)  # it counts all the same
+
+
+def test_three_events_are_no_edge_and_the_first_of_four_is():
+    for run_length, moves in ((3, False), (4, True)):
+        clock = clock_at()
+        t = np.concatenate([np.arange(4) * 0.01, 2.1 + np.arange(run_length) * 0.1]) * BIT
+        polarity = np.repeat([1, -1], [4, run_length]).astype(np.int8)
+        run(clock, t, polarity, 4)
+        assert (clock.values[BORDER] != 4 * BIT) == moves
+    assert 0.0 < clock.values[BORDER] - 4 * BIT < 0.1 * BIT + 1.0
+
+
+def test_edges_far_from_the_borders_are_not_its_own():
+    clock = clock_at()
+    t, polarity = events_of(np.arange(40) % 2, t0_ns=round(0.45 * BIT))
+    run(clock, t, polarity, 40)
+    assert clock.values[BORDER] == 40 * BIT
+
+
+# --- uncertainty --------------------------------------------------------------------------------------------------
+
+
+def test_uncertainty_falls_with_edges_and_grows_without():
+    t, polarity = events_of(random_line(200))
+    clock = clock_at()
+    known = [clock.values[[P_PHASE, P_PERIOD]].copy()]
+    first = 0
+    for _ in range(2):
+        _, _, first = run(clock, t, polarity, 100, first=first)
+        known.append(clock.values[[P_PHASE, P_PERIOD]].copy())
+    assert (known[1] < known[0]).all() and known[2][1] < known[1][1]
+    for _ in range(2):
+        run(clock, t, polarity, 200, first=len(t))
+        known.append(clock.values[[P_PHASE, P_PERIOD]].copy())
+    assert (known[3] > known[2]).all() and (known[4] > known[3]).all()
+    # However long the silence is, phase and period are not unknown altogether, and the matrix stays one.
+    go_on(clock.values, clock.counts, 10_000_000)
+    assert np.isfinite(clock.values).all()
+    assert 0.0 < clock.values[P_PHASE] <= 0.3**2 + 1e-12 and 0.0 < clock.values[P_PERIOD] <= 0.003**2 + 1e-12
+    assert clock.values[BORDER] == pytest.approx((600 + 10_000_000) * BIT, rel=1e-3)
+
+
+def test_the_estimate_of_the_period_is_as_good_as_it_says():
+    wrongs, deviations = [], []
+    for seed in range(60):
+        random = np.random.default_rng(seed)
+        bits = random_line(300, seed)
+        edges = np.flatnonzero(np.diff(bits.astype(int))) + 1
+        at = (edges + random.normal(0.0, 0.05, len(edges))) * BIT
+        t = (at[:, None] + np.arange(4) * 1.0).ravel()
+        polarity = np.repeat(np.where(bits[edges] == 1, 1, -1), 4).astype(np.int8)
+        clock = clock_at(period=BIT * (1.0 + random.normal(0.0, 1e-3)), period_error=1e-3)
+        run(clock, t, polarity, 300)
+        wrongs.append(clock.values[PERIOD] / BIT - 1.0)
+        deviations.append(clock.values[P_PERIOD] ** 0.5)
+    # Edges jitter by 0.05 bit; the clock also allows for a drift that is not there.
+    assert 0.3 < np.std(wrongs) / np.mean(deviations) < 1.3
