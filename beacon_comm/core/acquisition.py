@@ -6,7 +6,8 @@ For a period T near the expected one, over a window of some characters::
                  95 % of its best: it falls off a cliff on the late side
     2. slicer    bit = more ON or more OFF; few events: as the bit before
     3. learning  histograms from the bits, bits from the histograms: free, then under the frame
-    4. verdict   how many words of the framed path are also what the free bits say: those could have failed
+    4. verdict   how many words of the framed path are also what the free bits say: those could have failed, as the
+                 histograms behind the free bits have not seen the frame
 
 The eye chooses among the periods around the expected one; the edges of the window then fit period and latencies.
 The LED may also be on for 0: the frame is looked for in the bits and in their complement.
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 from beacon_comm.core.bit_clock import EDGE_RUN, BitClock, make_clock
 from beacon_comm.core.likelihood import CONTEXTS, COUNTS, LEVELS, SUB_SLOTS, learn, logarithms, weigh
 from beacon_comm.core.sequence_detection import SILENT_SHARE, Detection, make_detection
-from beacon_comm.core.trellis import Transitions, framed_path, free_bits
+from beacon_comm.core.trellis import Transitions, framed_path, free_bits, place_margin
 
 PHASES = 16
 """Phases of a bit at which the eye is measured."""
@@ -35,6 +36,9 @@ EYE_SHARE = 0.95
 REFERENCE_EVENTS = 100.0
 """Counts of signals with more events a bit are divided down to so many."""
 
+FREE_ROUNDS, FRAMED_ROUNDS = 2, 2
+"""Rounds of learning without the frame, then with it."""
+
 SLICER_SHARE = 0.1
 """A bit whose ON and OFF events differ by less than this share of a mean bit's events is held."""
 
@@ -42,7 +46,7 @@ CLEAR_FAILING, CLEAR_MARGIN = 0.15, 18.0
 """A lock is clear with at most so many failing words for each that passes, and a place in the frame so much more likely
 (nat) than any other: a few letters may fit two places, and other rates fit by chance …"""
 
-LONG_WORDS, LONG_FAILING, LONG_MARGIN = 12, 1.0, 35.0
+LONG_WORDS, LONG_FAILING, LONG_MARGIN = 12, 0.5, 35.0
 """… or with so many passing words, where more of them may fail (a weak signal), but none other is nearly as likely."""
 
 FULL_WORDS, FULL_SHARE = 8, 0.6
@@ -69,7 +73,7 @@ class Verdict(NamedTuple):
         changes: of level in a passing word, mean.
         bits: bits of the window.
         likelihood: of the framed path (nat).
-        place_margin: see :func:`beacon_comm.core.trellis.framed_path` (nat).
+        place_margin: see :func:`beacon_comm.core.trellis.place_margin`, of a bit in the middle of the window (nat).
         oversampled: the greatest share of the changes of level that lie on every second or every third bit.
     """
 
@@ -157,10 +161,8 @@ def acquire(
     eyes = _eyes(t, polarity, start, periods, stop)
     found: Lock | None = None
     for k in np.argsort(-eyes, kind='stable')[:tried]:
-        lock = _read(t, polarity, start, stop, float(periods[k]), transitions, compression)
-        if lock is None or lock.verdict.passing < needed:
-            continue
-        if not lock.verdict.convinces:
+        lock = _read(t, polarity, start, stop, float(periods[k]), transitions, compression, needed)
+        if lock is None or lock.verdict.passing < needed or not lock.verdict.convinces:
             continue
         if found is None or _merit(lock.verdict) > _merit(found.verdict):
             found = lock
@@ -179,6 +181,7 @@ def _read(
     period: float,
     transitions: Transitions,
     compression: NDArray[np.uint8],
+    needed: int,
 ) -> Lock | None:
     fit = np.zeros(5)
     for _ in range(2):
@@ -189,15 +192,27 @@ def _read(
     raw = _counts(t, polarity, border, period, bits)
     gain = max(1.0, raw.sum() / bits / REFERENCE_EVENTS)
     counts = compression[np.minimum((raw / gain + 0.5).astype(np.int64), len(compression) - 1)]
-    histograms, path, free, likelihood, margin, inverted = _learn_blind(raw, counts, transitions)
+    histograms, likelihoods, free = _learn_free(raw, counts)
+    path, likelihood = framed_path(transitions, likelihoods)
+    other_path, other_likelihood = framed_path(transitions, likelihoods[:, ::-1].copy())
+    inverted = other_likelihood > likelihood
+    if inverted:
+        path, likelihood, free = other_path, other_likelihood, free ^ 1
+    if _judge(path, free, transitions.length)[0] < needed:
+        return None
+    histograms, likelihoods, path = _learn_framed(counts, path, transitions, inverted)
     passing, failing, idle, changes = _judge(path, free, transitions.length)
     covered = passing * transitions.length
-    verdict = Verdict(passing, failing, idle, covered, changes / max(passing, 1), bits, likelihood, margin, _oversampled(free))
+    framed = np.flatnonzero(path // (2 * CONTEXTS) < transitions.length)
+    middle = int(framed[len(framed) // 2]) if len(framed) else 0
+    margin = place_margin(transitions, likelihoods, middle)
+    verdict = Verdict(
+        passing, failing, idle, covered, changes / max(passing, 1), bits, likelihood, margin, _oversampled(free)
+    )
     if inverted:
         histograms = np.concatenate((histograms[::-1, SUB_SLOTS:], histograms[::-1, :SUB_SLOTS]), axis=1)
     means = _means(raw / gain, path)
-    framed = path // (2 * CONTEXTS) < transitions.length
-    silence = float(np.mean(raw.sum(axis=1)[framed] < SILENT_SHARE * gain * means.mean())) if framed.any() else 1.0
+    silence = float(np.mean(raw.sum(axis=1)[framed] < SILENT_SHARE * gain * means.mean())) if len(framed) else 1.0
     # Latencies of the edges behind the borders, of which the fold knows only the fraction of a bit.
     latency = [((fit[k] * 1.0 - (border - start) / period + 0.3) % 1.0 - 0.3) * period for k in (1, 2)]
     if inverted:
@@ -348,32 +363,33 @@ def _weigh_all(tables, counts):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _learn_blind(raw, counts, transitions):  # type: ignore[no-untyped-def]
-    """Learn histograms from the counts alone.
-
-    Returns histograms, framed path (states), free bits in the frame's sense, log likelihood and margin of the framed
-    path, and whether the frame lies in the complement of the bits (the histograms are those of the bits themselves).
-    """
+def _learn_free(raw, counts):  # type: ignore[no-untyped-def]
+    """Learn from the counts alone, without the frame; return histograms, log p ``(bits, CONTEXTS)``, and bits."""
     tables = np.empty((CONTEXTS, COUNTS, LEVELS))
     bits = _slice(raw)
-    for _ in range(2):
-        _learn_from(counts, bits, tables)
-        bits = free_bits(_weigh_all(tables, counts))
     histograms = _learn_from(counts, bits, tables)
     likelihoods = _weigh_all(tables, counts)
-    path, likelihood, margin = framed_path(transitions, likelihoods)
-    other_path, other_likelihood, _ = framed_path(transitions, likelihoods[:, ::-1].copy())
-    inverted = other_likelihood > likelihood
+    for _ in range(FREE_ROUNDS):
+        bits = free_bits(likelihoods)
+        histograms = _learn_from(counts, bits, tables)
+        likelihoods = _weigh_all(tables, counts)
+    return histograms, likelihoods, free_bits(likelihoods)
+
+
+@njit(cache=True, nogil=True)
+def _learn_framed(counts, path, transitions, inverted):  # type: ignore[no-untyped-def]
+    """Learn on, from a framed path; return histograms (of the bits, not of their complement), log p and path."""
+    tables = np.empty((CONTEXTS, COUNTS, LEVELS))
+    histograms = np.empty((CONTEXTS, COUNTS, LEVELS))
+    likelihoods = np.empty((len(counts), CONTEXTS))
     flip = 1 if inverted else 0
-    if inverted:
-        path, likelihood = other_path, other_likelihood
-    for _ in range(2):
+    for _ in range(FRAMED_ROUNDS):
         histograms = _learn_from(counts, ((path & 1) ^ flip).astype(np.uint8), tables)
         likelihoods = _weigh_all(tables, counts)
         if inverted:
             likelihoods = likelihoods[:, ::-1].copy()
-        path, likelihood, margin = framed_path(transitions, likelihoods)
-    return histograms, path, free_bits(likelihoods), likelihood, margin, inverted
+        path, _ = framed_path(transitions, likelihoods)
+    return histograms, likelihoods, path
 
 
 @njit(cache=True, nogil=True)

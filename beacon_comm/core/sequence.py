@@ -108,6 +108,10 @@ class SequenceDemodulator:
         self._t = np.concatenate((self._t, (t_ns - self._origin_ns).astype(np.float64)))
         self._polarity = np.concatenate((self._polarity, polarity))
         t_end = float(t_end_ns - self._origin_ns)
+        if len(t_ns):
+            for search in self._searches:
+                if search.due == math.inf:  # it met a silence
+                    search.restart(float(t_ns[0] - self._origin_ns))
         characters: list[Character] = []
         while True:
             if self._lock is not None:
@@ -192,7 +196,7 @@ class SequenceDemodulator:
     def _character(self, row: NDArray[np.float64]) -> Character | None:
         """Return the character of a row, None if it is not to be given out."""
         word, kind, period, start = int(row[WORD]), row[KIND], float(row[PERIOD_THEN]), float(row[BORDER_OF_START])
-        if kind == KIND_UNREADABLE or start < self._given_to - 0.5 * period:
+        if kind == KIND_UNREADABLE or start < self._given_to - 0.5 * self._frame.length * period:
             return None
         self._given_to = start + self._frame.length * period
         code, status = self._decode[word]

@@ -35,7 +35,7 @@ DELAY_FRAMES = 2
 OK_FRAME_MARGIN = 6.0
 """A frame margin (nat) from which on a word is ok although the free bits differ …"""
 
-OK_MARGIN = 8.0
+OK_MARGIN = 4.0
 """… or a bit of it is an erasure; and in any case it has to beat every other word and path by this (nat)."""
 
 READABLE_MARGIN = 3.0
@@ -355,14 +355,15 @@ def _decide_word(clock, state, layout, length, best, at, lag, row):  # type: ign
             other = max(other, metric[to])
             metric[to] = UNLIKELY
     margin = min(word_margin, agreeing - other, MOST_MARGIN)
-    ok = margin >= OK_MARGIN and (frame_margin >= OK_FRAME_MARGIN or (word == free and not erased))
-    if ok:
+    passes = frame_margin >= OK_FRAME_MARGIN or (word == free and not erased)
+    ok = passes and margin >= OK_MARGIN
+    if passes:
         numbers[DOUBT] = max(0, numbers[DOUBT] - length)
     elif not erased:
         numbers[DOUBT] += length
-    if ok or word_margin >= LEARNING_MARGIN:
+    if passes or word_margin >= LEARNING_MARGIN:
         _learn_word(state, length, before, word, at)
-    clock.numbers[FROZEN] = 0 if ok else 1
+    clock.numbers[FROZEN] = 0 if passes else 1
     row[WORD], row[MARGIN], row[PERIOD_THEN] = word, margin, clock.values[PERIOD]
     row[KIND] = KIND_OK if ok else KIND_UNREADABLE if erased and margin < READABLE_MARGIN else KIND_REPAIRED
     row[BORDER_OF_START] = state.borders[(at - length + 1) & _RING_MASK]

@@ -178,10 +178,7 @@ def free_bits(likelihoods):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def framed_path(transitions, likelihoods):  # type: ignore[no-untyped-def]
-    """Return the most likely framed path: states, ``(n,)`` int32, its log likelihood, and its margin (nat).
-
-    The margin is that over the best path on which the last bit has another place in its frame.
-    """
+    """Return the states on the most likely framed path, ``(n,)`` int32, and its log likelihood (nat)."""
     count = len(likelihoods)
     metric = np.zeros(transitions.states)
     fresh = np.empty(transitions.states)
@@ -193,13 +190,32 @@ def framed_path(transitions, likelihoods):  # type: ignore[no-untyped-def]
         )
     path = np.empty(count, np.int32)
     state = np.argmax(metric)
-    position = state // (2 * CONTEXTS)
-    other = UNLIKELY
-    for to in range(transitions.length * 2 * CONTEXTS):
-        if to // (2 * CONTEXTS) != position:
-            other = max(other, metric[to])
-    margin = metric[state] - other
     for n in range(count - 1, -1, -1):
         path[n] = state
         state = best[n, state]
-    return path, total, margin
+    return path, total
+
+
+@njit(cache=True, nogil=True)
+def place_margin(transitions, likelihoods, at):  # type: ignore[no-untyped-def]
+    """Return by how much (nat) the best path beats the best one on which the bit ``at`` has another place in its frame."""
+    metric = np.zeros(transitions.states)
+    fresh = np.empty(transitions.states)
+    best = np.empty(transitions.states, np.int32)
+    for n in range(at + 1):
+        framed_step(transitions.source, transitions.target, transitions.cost, metric, fresh, best, likelihoods[n])
+    source, target, cost = transitions.source, transitions.target, transitions.cost
+    later = np.zeros(transitions.states)
+    for n in range(len(likelihoods) - 1, at, -1):
+        fresh[:] = UNLIKELY
+        for i in range(len(source)):
+            value = later[target[i]] + likelihoods[n, target[i] & (CONTEXTS - 1)] - cost[i]
+            if value > fresh[source[i]]:
+                fresh[source[i]] = value
+        later[:] = fresh
+    places = np.full(transitions.length + 2, UNLIKELY)
+    for state in range(transitions.states):
+        place = state // (2 * CONTEXTS)
+        places[place] = max(places[place], metric[state] + later[state])
+    places.sort()
+    return places[-1] - places[-2]
