@@ -27,6 +27,8 @@ class OneEventOneCharacter:
     """A demodulator for tests: an event's time becomes a character of TEXT; an OFF event's has the wrong parity."""
 
     bit_rate_bps = RATE_BPS
+    bit_rate_std_bps = None
+    given_up = False
 
     def __init__(self, parameters: Parameters) -> None:
         self.held: list[Character] = []

@@ -48,7 +48,7 @@ def check_schema(result: object) -> None:
         'recording', 'receiver', 'events', 'seconds', 'mev_per_s', 'lost_packets', 'skipped_words', 'beacons',
     ]  # fmt: skip
     assert isinstance(result['recording'], str)
-    assert result['receiver'] == 'threshold'
+    assert result['receiver'] == 'sequence'
     assert all(type(result[key]) is int for key in ('events', 'lost_packets', 'skipped_words'))
     assert isinstance(result['seconds'], number)
     assert isinstance(result['mev_per_s'], number)

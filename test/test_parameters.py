@@ -29,7 +29,7 @@ def test_every_parameter_has_a_meaning_and_every_number_a_bound() -> None:
         ('hop_s', float('nan'), r'hop_s = nan: must be a number'),
         ('candidate_slots', 2.5, r'candidate_slots = 2\.5: must be a whole number'),
         ('candidate_slots', True, r'candidate_slots = True: must be a number'),
-        ('receiver', 'magic', r"receiver = 'magic': must be one of threshold"),
+        ('receiver', 'magic', r"receiver = 'magic': must be one of sequence, threshold"),
         ('bit_rates', (), r'bit_rates = \(\): must be a list'),
         ('bit_rates', (504, 5), r'bit_rates = 5: must lie in \[20, 10000\] bps'),
         ('idle_start', 1, r'idle_start = 1: must be true or false'),

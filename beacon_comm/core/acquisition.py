@@ -142,7 +142,7 @@ def acquire(
     transitions: Transitions,
     compression: NDArray[np.uint8],
     needed: int,
-    tried: int = 3,
+    tried: int,
 ) -> Lock | None:
     """Look for a beacon in a window of events.
 

@@ -31,7 +31,7 @@ COUNTS = 2 * SUB_SLOTS
 LEVELS = 32
 """Compressed counts are 0 to LEVELS - 1."""
 
-BACK_OFF = 10.0
+BACK_OFF = 4.0
 """A shorter context's histogram weighs as much as so many bits of the longer one."""
 
 FLOOR = 2e-3

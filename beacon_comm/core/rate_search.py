@@ -33,6 +33,9 @@ from beacon_comm.core.parameters import Parameters
 LISTED_SPREAD = 0.025
 """A clock's rate is looked for within so much of its nominal value."""
 
+TRIED = 4
+"""Periods of a group that are read."""
+
 PERIOD_STEP = 0.15
 """Periods are tried so close that the window's ends move by so much (bit)."""
 
@@ -40,7 +43,7 @@ LISTED_ATTEMPTS = (5, 6, 7, 8, 10, 12, 15, 18, 22, 26, 30)
 BLIND_ATTEMPTS = (12, 16, 20, 25)
 """Attempts are made so many characters after the first event …"""
 
-LATER_STEP, LATER_SHARE = 6, 0.2
+LATER_STEP, LATER_SHARE = 6, 0.4
 """… and then after so many more, or after this share of all so far if that is more."""
 
 BLIND_OCTAVES = (5000.0, 2500.0, 1250.0, 625.0, 312.5, 156.25, 100.0)
@@ -55,7 +58,7 @@ BINS_PER_BIT = 4
 COMB = 8
 """Multiples of a character's duration that are summed."""
 
-NAMED = 3
+NAMED = 2
 """Periods that each statement names."""
 
 NAMED_SPREAD = 0.004
@@ -88,6 +91,7 @@ class RateSearch:
     Attributes:
         period: nominal period of a bit, or the longest of several (ns).
         needed: words that have to pass.
+        tried: periods of each group that are read, those with the widest eye.
         longest: events so far back may still be needed (ns).
     """
 
@@ -97,6 +101,7 @@ class RateSearch:
         self._character = frame.duration_ns(bit_rate_bps)
         self._length = frame.length
         self._attempts = attempts
+        self.tried = TRIED
         self.longest = KEPT_CHARACTERS * self._character
         self.restart(0.0)
 
@@ -157,9 +162,8 @@ class ListedSearch(RateSearch):
         super().__init__(bit_rate_bps, frame, LISTED_NEEDED, LISTED_ATTEMPTS)
 
     def periods(self, t: NDArray[np.float64], polarity: NDArray[np.int8]) -> Iterator[NDArray[np.float64]]:
-        """Yield the nominal period, then those around it."""
+        """Yield the periods around the nominal one."""
         bits = max(t[-1] - t[0], self._character) / self.period
-        yield np.array([self.period])  # most clocks are right to a tenth of a percent
         yield periods_around(self.period, LISTED_SPREAD, bits)
 
 
@@ -168,6 +172,7 @@ class OctaveSearch(RateSearch):
 
     def __init__(self, slowest_bps: float, frame: CharacterFrame) -> None:
         super().__init__(slowest_bps, frame, BLIND_NEEDED, BLIND_ATTEMPTS)
+        self.tried = 1
 
     def periods(self, t: NDArray[np.float64], polarity: NDArray[np.int8]) -> Iterator[NDArray[np.float64]]:
         """Yield the surroundings of the periods that autocorrelation and spectra name."""

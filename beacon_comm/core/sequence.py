@@ -25,7 +25,7 @@ from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.likelihood import MEMORY_BITS, compression_table
 from beacon_comm.core.parameters import Parameters
-from beacon_comm.core.rate_search import READ_BACK_CHARACTERS, RateSearch, make_searches
+from beacon_comm.core.rate_search import READ_BACK_CHARACTERS, TRIED, RateSearch, make_searches
 from beacon_comm.core.sequence_detection import (
     BORDER_OF_START,
     FIRST_RATIO,
@@ -45,6 +45,9 @@ from beacon_comm.core.sequence_detection import (
 )
 from beacon_comm.core.soft_decision import confidence_of, frame_layout
 from beacon_comm.core.trellis import framed_transitions
+
+ADJACENT_BITS = 15
+"""The character before a lock's first ok one is given out, too, if no more bits lie between their starts."""
 
 REFINED_AFTER = 25
 """Phase and histograms of a lock are learnt anew once over so many characters: a lock begins with a handful."""
@@ -72,6 +75,9 @@ class SequenceDemodulator:
         self._most_events = parameters.buffer_max_bytes // 9
         self._rows = np.zeros((_ROWS, FIRST_RATIO + self._frame.length))
         self._lock: Lock | None = None
+        self._ended: Lock | None = None  # the lock at the stream's end
+        self._pending: Character | None = None  # said before the lock's first ok character
+        self._trusted = False  # the lock has said an ok character
         self._origin_ns: int | None = None
         self._t = np.empty(0, np.float64)
         self._polarity = np.empty(0, np.int8)
@@ -82,15 +88,17 @@ class SequenceDemodulator:
 
     @property
     def bit_rate_bps(self) -> float | None:
-        """The bit rate of the present lock (bit/s), None without one."""
-        return None if self._lock is None else NS_PER_S / float(self._lock.clock.values[PERIOD])
+        """The bit rate of the present lock, or of the one at the stream's end (bit/s), None without one."""
+        lock = self._lock or self._ended
+        return None if lock is None else NS_PER_S / float(lock.clock.values[PERIOD])
 
     @property
     def bit_rate_std_bps(self) -> float | None:
         """Standard deviation of :attr:`bit_rate_bps` (bit/s), None without a lock."""
-        if self._lock is None:
+        lock = self._lock or self._ended
+        if lock is None:
             return None
-        values = self._lock.clock.values
+        values = lock.clock.values
         return math.sqrt(float(values[P_PERIOD])) * NS_PER_S / float(values[PERIOD])
 
     @property
@@ -105,6 +113,7 @@ class SequenceDemodulator:
                 return []
             self._origin_ns = int(t_ns[0])
             self._restart(0.0)
+        self._ended = None
         self._t = np.concatenate((self._t, (t_ns - self._origin_ns).astype(np.float64)))
         self._polarity = np.concatenate((self._polarity, polarity))
         t_end = float(t_end_ns - self._origin_ns)
@@ -134,6 +143,7 @@ class SequenceDemodulator:
         count = end_detection(lock.clock, lock.detection, self._transitions, self._layout, self._rows)
         characters = self._characters(self._rows[:count])
         self._unlock()
+        self._ended = lock
         return characters
 
     # Locked
@@ -168,7 +178,7 @@ class SequenceDemodulator:
         first = int(np.searchsorted(self._t, self._refine_at - REFINED_AFTER * self._frame.length * period))
         self._refine_at = math.inf
         window = slice(first, stop)
-        better = self._acquire(window, period * REFINED_PERIODS, REFINED_AFTER // 2)
+        better = self._acquire(window, period * REFINED_PERIODS, REFINED_AFTER // 2, TRIED)
         if better is not None and better.inverted == lock.inverted:
             self._begin(better, max(self._given_to - 2.0 * self._frame.length * period, float(self._t[first])))
 
@@ -189,8 +199,16 @@ class SequenceDemodulator:
         characters = []
         for row in rows:
             character = self._character(row)
-            if character is not None:
+            if character is None:
+                continue
+            if self._trusted or character.status is Status.OK:
+                pending, self._pending = self._pending, None
+                if pending is not None and character.t_ns - pending.t_ns < ADJACENT_BITS * float(row[PERIOD_THEN]):
+                    characters.append(pending)
                 characters.append(character)
+                self._trusted = True
+            else:
+                self._pending = character  # perhaps read into what was there before the beacon
         return characters
 
     def _character(self, row: NDArray[np.float64]) -> Character | None:
@@ -237,14 +255,14 @@ class SequenceDemodulator:
     def _look(self, search: RateSearch, window: slice) -> Lock | None:
         t, polarity = self._t[window], self._polarity[window]
         for periods in search.periods(t, polarity):
-            lock = self._acquire(window, periods, search.needed)
+            lock = self._acquire(window, periods, search.needed, search.tried)
             if lock is not None:
                 return lock
         return None
 
-    def _acquire(self, window: slice, periods: NDArray[np.float64], needed: int) -> Lock | None:
+    def _acquire(self, window: slice, periods: NDArray[np.float64], needed: int, tried: int) -> Lock | None:
         return acquire(
-            self._t[window], self._polarity[window], periods, self._transitions, self._compression, needed
+            self._t[window], self._polarity[window], periods, self._transitions, self._compression, needed, tried
         )
 
     def _choose(self, found: RateSearch, now: float, first: int, stop: int, lock: Lock | None) -> Lock | None:
@@ -265,6 +283,7 @@ class SequenceDemodulator:
     def _start(self, lock: Lock, first: int) -> None:
         """Follow a lock from the buffer's beginning on."""
         border = float(lock.clock.values[BORDER])
+        self._trusted = False
         self._refine_at = border + REFINED_AFTER * self._frame.length * lock.period
         if len(lock.positions) > (REFINED_AFTER - 5) * self._frame.length:
             self._refine_at = math.inf
@@ -284,8 +303,9 @@ class SequenceDemodulator:
             at += int(framed[0])
             place = (int(positions[at]) + bits - at) % length
         start_at(lock.detection, place, length)
-        self._taken = int(np.searchsorted(self._t, values[BORDER]))
+        self._taken = int(np.searchsorted(self._t, t))  # what lies before may be gone from the buffer
         self._lock = lock
+        self._pending = None
 
     def _forget(self, t_end: float) -> None:
         """Drop the events that nothing can need any more."""

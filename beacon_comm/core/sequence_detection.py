@@ -41,6 +41,12 @@ OK_MARGIN = 4.0
 READABLE_MARGIN = 3.0
 """A word with an erased bit that beats the next one by less (nat) is not given out: it would be invented."""
 
+LEAST_EVENTS = 0.1
+"""A word with less than this share of the events that its bits should have is read into a silence: it is not given out.
+
+A start bit is a fall and the stop bits end in a rise, so that there is no word without events.
+"""
+
 MOST_MARGIN = 100.0
 """Margins are not told beyond this (nat)."""
 
@@ -355,6 +361,9 @@ def _decide_word(clock, state, layout, length, best, at, lag, row):  # type: ign
             other = max(other, metric[to])
             metric[to] = UNLIKELY
     margin = min(word_margin, agreeing - other, MOST_MARGIN)
+    if _events_share(state, length, before, word, at) < LEAST_EVENTS:
+        row[WORD], row[KIND] = word, KIND_UNREADABLE
+        return
     passes = frame_margin >= OK_FRAME_MARGIN or (word == free and not erased)
     ok = passes and margin >= OK_MARGIN
     if passes:
@@ -367,6 +376,17 @@ def _decide_word(clock, state, layout, length, best, at, lag, row):  # type: ign
     row[WORD], row[MARGIN], row[PERIOD_THEN] = word, margin, clock.values[PERIOD]
     row[KIND] = KIND_OK if ok else KIND_UNREADABLE if erased and margin < READABLE_MARGIN else KIND_REPAIRED
     row[BORDER_OF_START] = state.borders[(at - length + 1) & _RING_MASK]
+
+
+@njit(cache=True, nogil=True)
+def _events_share(state, length, before, word, at):  # type: ignore[no-untyped-def]
+    """Return the events of a word as a share of those that its bits should have."""
+    seen, expected, context = 0.0, 1e-9, before
+    for k in range(length):
+        context = (context << 1 | (word >> (length - 1 - k) & 1)) & (CONTEXTS - 1)
+        seen += state.totals[(at - length + 1 + k) & _RING_MASK]
+        expected += state.means[context] * state.levels[GAIN]
+    return seen / expected
 
 
 @njit(cache=True, nogil=True)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.likelihood import CONTEXTS
 
-IDLE_COST = 10.0
+IDLE_COST = 8.0
 """Price of leaving the stream of characters for the idle line (nat)."""
 
 IDLE_STAY_COST = 0.1
@@ -34,7 +34,7 @@ IDLE_STAY_COST = 0.1
 NOISE_COST = 40.0
 """Price of giving the frame up (nat)."""
 
-NOISE_STAY_COST = 1.0
+NOISE_STAY_COST = 0.5
 """Price of each bit that is free (nat): more than a bit of a frame, that is free itself, should cost."""
 
 NOISE_EXIT_COST = 2.0
