@@ -18,15 +18,14 @@ from beacon_comm.simulation.led import noise, square_wave
 TEXT = "Rough winds do shake the darling buds of May,\nAnd summer's lease"
 RATES = (100.0, 504.0, 1000.0, 3125.0, 8000.0)
 FRAME = CharacterFrame()
-WINDOW_END = pytest.mark.xfail(strict=True, reason='the place margin is that of the last bit alone: clear windows are refused')
-HALF_RATE = pytest.mark.xfail(strict=True, reason='at half the rate short windows fit whatever the frame says')
+PAUSES = pytest.mark.xfail(strict=True, reason='noise is cheaper than a pause after every character')
 TRANSITIONS = framed_transitions(FRAME)
 COMPRESSION = compression_table()
 
 
 def found(events, periods, needed=4, transitions=TRANSITIONS):
     t_ns, polarity = events
-    return acquire((t_ns - t_ns[0]).astype(np.float64), polarity, np.asarray(periods), transitions, COMPRESSION, needed)
+    return acquire((t_ns - t_ns[0]).astype(np.float64), polarity, np.asarray(periods), transitions, COMPRESSION, needed, 3)
 
 
 def beacon(text, bit_rate_bps, skipped=0, ends_after=5, frame=None, **options):
@@ -109,7 +108,6 @@ def test_time_of_day_does_not_matter(t0_ns):
     assert lock.verdict.passing == 12 and lock.period == pytest.approx(1e6, rel=1e-3)
 
 
-@WINDOW_END
 def test_a_window_may_begin_and_end_anywhere():
     refused = []
     for bit_rate_bps in (504.0, 1000.0, 3125.0):
@@ -121,8 +119,9 @@ def test_a_window_may_begin_and_end_anywhere():
     assert refused == []
 
 
-@pytest.mark.parametrize('gap_bits', [2, 10, 30, 100])
-@WINDOW_END
+@pytest.mark.parametrize(
+    'gap_bits', [pytest.param(2, marks=PAUSES), pytest.param(10, marks=PAUSES), 30, 100]
+)
 def test_characters_that_stand_alone_are_found(gap_bits):
     lock = found(beacon_events(text_bits(TEXT[:12], gap_bits=gap_bits), 1000.0, lead_s=0.01, tail_s=0.01), [1e6])
     assert lock.verdict.passing == 12
@@ -143,7 +142,7 @@ def test_what_was_learnt_tells_ones_from_zeros():
 def test_the_window_is_left_as_it_was():
     t_ns, polarity = beacon(TEXT[:12], 1000.0)
     t, kept = t_ns.astype(np.float64), polarity.copy()
-    acquire(t, polarity, np.array([1e6]), TRANSITIONS, COMPRESSION, 4)
+    acquire(t, polarity, np.array([1e6]), TRANSITIONS, COMPRESSION, 4, 3)
     assert np.array_equal(t, t_ns) and np.array_equal(polarity, kept)
 
 
@@ -173,7 +172,6 @@ def test_another_rate_is_refused(bit_rate_bps, factor):
         assert found(events, periods_around(NS / (bit_rate_bps * factor), 0.025, 275 * factor)) is None
 
 
-@HALF_RATE
 def test_half_the_rate_is_refused():
     taken = []
     for bit_rate_bps in (504.0, 3125.0, 8000.0):
@@ -194,14 +192,14 @@ def test_a_signal_read_at_twice_its_rate_is_refused(codes, skipped):
 
 def test_nothing_and_next_to_nothing_is_refused():
     empty = (np.empty(0), np.empty(0, np.int8))
-    assert acquire(*empty, np.array([1e6]), TRANSITIONS, COMPRESSION, 4) is None
-    assert acquire(np.zeros(3), np.ones(3, np.int8), np.array([1e6]), TRANSITIONS, COMPRESSION, 4) is None
+    assert acquire(*empty, np.array([1e6]), TRANSITIONS, COMPRESSION, 4, 3) is None
+    assert acquire(np.zeros(3), np.ones(3, np.int8), np.array([1e6]), TRANSITIONS, COMPRESSION, 4, 3) is None
     for count in (16, 1000):
         burst = np.zeros(count), np.ones(count, np.int8)  # all at one time
-        assert acquire(*burst, np.array([1e6]), TRANSITIONS, COMPRESSION, 4) is None
+        assert acquire(*burst, np.array([1e6]), TRANSITIONS, COMPRESSION, 4, 3) is None
     held = np.arange(0.0, 300e6, 1e4)
     for level in (1, -1):
-        assert acquire(held, np.full(len(held), level, np.int8), np.array([1e6]), TRANSITIONS, COMPRESSION, 4) is None
+        assert acquire(held, np.full(len(held), level, np.int8), np.array([1e6]), TRANSITIONS, COMPRESSION, 4, 3) is None
 
 
 def test_fewer_words_than_needed_are_refused():

@@ -21,6 +21,7 @@ from beacon_comm.core.trellis import (
     framed_path,
     framed_transitions,
     free_bits,
+    place_margin,
 )
 
 TEXT = "Rough winds do shake the darling buds of May,\nAnd summer's lease hath all too short a date:"
@@ -42,7 +43,7 @@ SHORT_FRAMES = [
 
 def path_of(likelihoods, frame):
     """Return positions and bits of the framed path."""
-    path, _, _ = framed_path(framed_transitions(frame), likelihoods)
+    path, _ = framed_path(framed_transitions(frame), likelihoods)
     return path // (2 * CONTEXTS), path & 1
 
 
@@ -150,20 +151,19 @@ def test_garbage_leads_to_noise_and_text_out_of_it():
 
 
 def test_no_evidence_costs_nothing_and_is_no_word():
-    _, total, margin = framed_path(framed_transitions(CharacterFrame()), np.zeros((60, CONTEXTS)))
-    assert total == 0.0  # begins anywhere and runs on
-    assert margin == 0.0
+    transitions = framed_transitions(CharacterFrame())
+    assert framed_path(transitions, np.zeros((60, CONTEXTS)))[1] == 0.0  # begins anywhere and runs on
+    assert place_margin(transitions, np.zeros((60, CONTEXTS)), 30) == 0.0
 
 
 def test_place_margin_tells_text_that_fits_two_places():
-    def margin(text):
-        line = text_bits(text)
-        assert read(likelihoods_of(line), CharacterFrame())
-        return framed_path(framed_transitions(CharacterFrame()), likelihoods_of(line))[2]
+    def margin(line, at):
+        return place_margin(framed_transitions(CharacterFrame()), likelihoods_of(line), at)
 
     # 0 1101101 1 11: begun three bits later it is 0 1101111 0 11, and so on for ever.
-    assert margin('m' * 20) == 0.0
-    assert margin(TEXT[:20]) > 10.0
+    assert margin(text_bits('m' * 20), 110) == 0.0
+    for ending in ([], [1], idle(30), text_bits('L')[:5]):
+        assert margin(line_of_parts(text_bits(TEXT[:20]), ending), 110) > 40.0
 
 
 # --- against exhaustive search ------------------------------------------------------------------------------------
@@ -172,18 +172,21 @@ BITS = 9
 
 
 @lru_cache
-def prices(frame):
-    """Return the least price of every bit string by what its last bit is, ``(2 ** BITS, length + 2)``; inf: impossible.
+def prices(frame, at=BITS - 1):
+    """Return the least price of every bit string by the place of its bit ``at``, ``(2 ** BITS, length + 2)``; inf: none.
 
     Written from the description of the trellis, string by string and label by label.
     """
     found = np.full((1 << BITS, frame.length + 2), np.inf)
     for value, bits in enumerate(product((0, 1), repeat=BITS)):
         labels = {(place, parity): 0.0 for place in range(frame.length + 2) for parity in (0, 1)}
-        for bit in bits:
+        for bit in bits[: at + 1]:
             labels = after_bit(frame, labels, bit)
-        for (place, _), price in labels.items():
-            found[value, place] = min(found[value, place], price)
+        for place in {place for place, _ in labels}:
+            after = {label: price for label, price in labels.items() if label[0] == place}
+            for bit in bits[at + 1 :]:
+                after = after_bit(frame, after, bit)
+            found[value, place] = min(after.values(), default=np.inf)
     return found
 
 
@@ -249,10 +252,16 @@ def test_free_bits_against_all_bits(seed, spread):
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.3, 3.0, 10.0, 30.0]), st.sampled_from(SHORT_FRAMES))
 def test_framed_path_against_all_bits_and_all_frames(seed, spread, frame):
     likelihoods = np.random.default_rng(seed).normal(0.0, spread, (BITS, CONTEXTS))
-    path, total, margin = framed_path(framed_transitions(frame), likelihoods)
+    path, total = framed_path(framed_transitions(frame), likelihoods)
     values = string_values(likelihoods)[:, None] - prices(frame)
     assert total == pytest.approx(values.max(), abs=1e-9)
-    place = path[-1] // (2 * CONTEXTS)
-    assert values[as_number(path & 1), place] == pytest.approx(values.max(), abs=1e-9)
-    others = np.delete(values[:, : frame.length], place, axis=1) if place < frame.length else values[:, : frame.length]
-    assert margin == pytest.approx(values.max() - others.max(), abs=1e-9)
+    assert values[as_number(path & 1), path[-1] // (2 * CONTEXTS)] == pytest.approx(values.max(), abs=1e-9)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.3, 3.0, 10.0, 30.0]), st.sampled_from(SHORT_FRAMES[:2]))
+def test_place_margin_against_all_bits_and_all_frames(seed, spread, frame):
+    likelihoods = np.random.default_rng(seed).normal(0.0, spread, (BITS, CONTEXTS))
+    places = (string_values(likelihoods)[:, None] - prices(frame, 4)).max(axis=0)
+    best, second = np.sort(places)[[-1, -2]]
+    assert place_margin(framed_transitions(frame), likelihoods, 4) == pytest.approx(best - second, abs=1e-9)
