@@ -210,7 +210,7 @@ def test_fewer_words_than_needed_are_refused():
 
 def test_a_text_that_fits_two_places_is_refused():
     # 0 1101101 1 11: begun three bits later it is 0 1101111 0 11, and so on for ever.
-    assert found(beacon('m' * 12, 1000.0, skipped=5), [1e6]) is None
+    assert found(beacon('m' * 12, 1000.0, skipped=5, ends_after=0), [1e6]) is None
 
 
 # --- verdict ------------------------------------------------------------------------------------------------------

@@ -132,7 +132,7 @@ def test_a_long_silence_costs_nothing_and_the_clock_goes_on():
     more, status = locked.push(later, polarity, later[-1])
     assert status == STILL_LOCKED and locked.state.numbers[ASLEEP] == 0
     # An hour of a clock known to some ppm is many bits: the place is found anew.
-    assert said(np.concatenate([more, locked.end()])).endswith(TEXT[10:])
+    assert said(np.concatenate([more, locked.end()])).endswith(TEXT[20:])
 
 
 @pytest.mark.xfail(strict=True, reason='noise that is unlike all contexts is read as idle line')
