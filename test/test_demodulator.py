@@ -142,7 +142,7 @@ def noisy_events(seed, t0_ns=0):
 )
 def test_any_batching_gives_the_same_characters(seed, cuts, bit_rates):
     t_ns, polarity = noisy_events(seed)
-    parameters = Parameters(bit_rates=bit_rates)
+    parameters = Parameters(bit_rates=bit_rates, receiver='threshold')
     t_end_ns = int(t_ns[-1]) + 300_000_000
     # Cuts between batches, at events' own times, and in the silence at the end.
     cuts += [int(t_ns[cut % len(t_ns)]) for cut in cuts]
@@ -153,7 +153,7 @@ def test_any_batching_gives_the_same_characters(seed, cuts, bit_rates):
 
 @pytest.mark.parametrize('bit_rates', [(1000.0,), (400.0, 1000.0, 3125.0)])
 def test_clock_may_start_anywhere(bit_rates):
-    parameters = Parameters(bit_rates=bit_rates)
+    parameters = Parameters(bit_rates=bit_rates, receiver='threshold')
     reads = []
     for t0_ns in (0, 2**40):
         characters = decode(make_demodulator(parameters), *noisy_events(3, t0_ns))
@@ -165,7 +165,7 @@ def test_clock_may_start_anywhere(bit_rates):
 
 
 def test_one_listed_rate_is_settled_from_the_start():
-    for demodulator in (RateBank(Parameters(bit_rates=(1000.0,))), make_demodulator(Parameters(bit_rates=(1000.0,)))):
+    for demodulator in (RateBank(Parameters(bit_rates=(1000.0,))), make_demodulator(Parameters(bit_rates=(1000.0,), receiver='threshold'))):
         assert demodulator.bit_rate_bps == 1000.0
         t_ns, polarity = line_events(text_bits('ab'), 1000.0)
         assert text_of(demodulator.push(t_ns, polarity, int(t_ns[-1]))) == 'a'

@@ -75,6 +75,7 @@ class Verdict(NamedTuple):
         likelihood: of the framed path (nat).
         place_margin: see :func:`beacon_comm.core.trellis.place_margin`, of a bit in the middle of the window (nat).
         oversampled: the greatest share of the changes of level that lie on every second or every third bit.
+        spread: of the edges about the bit grid, standard deviation (bit).
     """
 
     passing: int
@@ -86,6 +87,7 @@ class Verdict(NamedTuple):
     likelihood: float
     place_margin: float
     oversampled: float
+    spread: float
 
     @property
     def share(self) -> float:
@@ -143,6 +145,7 @@ def acquire(
     compression: NDArray[np.uint8],
     needed: int,
     tried: int,
+    most_spread: float = 1.0,
 ) -> Lock | None:
     """Look for a beacon in a window of events.
 
@@ -154,6 +157,8 @@ def acquire(
         compression: table of compressed counts.
         needed: words that have to pass.
         tried: so many of the periods are read, those with the widest eye.
+        most_spread: standard deviation of the edges about the bit grid (bit) up to which a lock is believed; evenly
+            spread edges, of another rate, have 0.29.
     """
     if len(t) < EDGE_RUN * needed:
         return None
@@ -163,6 +168,8 @@ def acquire(
     for k in np.argsort(-eyes, kind='stable')[:tried]:
         lock = _read(t, polarity, start, stop, float(periods[k]), transitions, compression, needed)
         if lock is None or lock.verdict.passing < needed or not lock.verdict.convinces:
+            continue
+        if lock.verdict.spread > most_spread:
             continue
         if found is None or _merit(lock.verdict) > _merit(found.verdict):
             found = lock
@@ -207,7 +214,7 @@ def _read(
     middle = int(framed[len(framed) // 2]) if len(framed) else 0
     margin = place_margin(transitions, likelihoods, middle)
     verdict = Verdict(
-        passing, failing, idle, covered, changes / max(passing, 1), bits, likelihood, margin, _oversampled(free)
+        passing, failing, idle, covered, changes / max(passing, 1), bits, likelihood, margin, _oversampled(free), float(fit[3])
     )
     if inverted:
         histograms = np.concatenate((histograms[::-1, SUB_SLOTS:], histograms[::-1, :SUB_SLOTS]), axis=1)

@@ -55,6 +55,9 @@ OCTAVE_OVERLAP = 0.025
 BINS_PER_BIT = 4
 """Bins in a bit of an octave's fastest rate."""
 
+EDGE_SPREAD = 0.22
+"""Edges spread farther about the bit grid (bit) are those of another rate: the recordings' have 0.07 to 0.16."""
+
 COMB = 8
 """Multiples of a character's duration that are summed."""
 
@@ -92,6 +95,7 @@ class RateSearch:
         period: nominal period of a bit, or the longest of several (ns).
         needed: words that have to pass.
         tried: periods of each group that are read, those with the widest eye.
+        most_spread: of the edges about the bit grid (bit) up to which a lock is believed.
         longest: events so far back may still be needed (ns).
     """
 
@@ -102,6 +106,7 @@ class RateSearch:
         self._length = frame.length
         self._attempts = attempts
         self.tried = TRIED
+        self.most_spread = EDGE_SPREAD
         self.longest = KEPT_CHARACTERS * self._character
         self.restart(0.0)
 

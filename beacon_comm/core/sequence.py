@@ -25,7 +25,7 @@ from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.likelihood import MEMORY_BITS, compression_table
 from beacon_comm.core.parameters import Parameters
-from beacon_comm.core.rate_search import READ_BACK_CHARACTERS, TRIED, RateSearch, make_searches
+from beacon_comm.core.rate_search import EDGE_SPREAD, READ_BACK_CHARACTERS, TRIED, RateSearch, make_searches
 from beacon_comm.core.sequence_detection import (
     BORDER_OF_START,
     FIRST_RATIO,
@@ -81,6 +81,7 @@ class SequenceDemodulator:
         self._origin_ns: int | None = None
         self._t = np.empty(0, np.float64)
         self._polarity = np.empty(0, np.int8)
+        self._known_to = -math.inf  # the stream's time
         self._taken = 0  # events of the buffer that the lock has seen
         self._given_to = -math.inf  # end of the last character that was given out
         self._refine_at = math.inf  # time at which the lock is to be refined
@@ -133,15 +134,19 @@ class SequenceDemodulator:
             elif not self._attempt(t_end):
                 break
         self._forget(t_end)
+        self._known_to = t_end
         return characters
 
     def flush(self) -> list[Character]:
         """End the stream; see :class:`beacon_comm.core.demodulator.Demodulator`."""
-        if self._lock is None:
-            return []
+        if self._lock is None and len(self._t):
+            self._attempt_all()
         lock = self._lock
+        if lock is None:
+            return []
+        before = self._follow(lock, self._known_to)[1]
         count = end_detection(lock.clock, lock.detection, self._transitions, self._layout, self._rows)
-        characters = self._characters(self._rows[:count])
+        characters = before + self._characters(self._rows[:count])
         self._unlock()
         self._ended = lock
         return characters
@@ -178,7 +183,7 @@ class SequenceDemodulator:
         first = int(np.searchsorted(self._t, self._refine_at - REFINED_AFTER * self._frame.length * period))
         self._refine_at = math.inf
         window = slice(first, stop)
-        better = self._acquire(window, period * REFINED_PERIODS, REFINED_AFTER // 2, TRIED)
+        better = self._acquire(window, period * REFINED_PERIODS, REFINED_AFTER // 2, TRIED, EDGE_SPREAD)
         if better is not None and better.inverted == lock.inverted:
             self._begin(better, max(self._given_to - 2.0 * self._frame.length * period, float(self._t[first])))
 
@@ -252,18 +257,32 @@ class SequenceDemodulator:
             self._start(lock, first)
         return True
 
+    def _attempt_all(self) -> None:
+        """Make a last attempt at every rate: the stream ends, and a short message may still wait for the slower ones."""
+        first, stop = int(np.searchsorted(self._t, self._usable_from)), len(self._t)
+        locks = []
+        for search in self._searches:
+            window = search.window(self._t, float(self._t[-1]), first, stop)
+            lock = None if window is None else self._look(search, window)
+            if lock is not None:
+                locks.append(lock)
+        if locks:
+            self._start(max(locks, key=lambda lock: lock.verdict.merit), first)
+            self._refine_at = math.inf
+
     def _look(self, search: RateSearch, window: slice) -> Lock | None:
         t, polarity = self._t[window], self._polarity[window]
         for periods in search.periods(t, polarity):
-            lock = self._acquire(window, periods, search.needed, search.tried)
+            lock = self._acquire(window, periods, search.needed, search.tried, search.most_spread)
             if lock is not None:
                 return lock
         return None
 
-    def _acquire(self, window: slice, periods: NDArray[np.float64], needed: int, tried: int) -> Lock | None:
-        return acquire(
-            self._t[window], self._polarity[window], periods, self._transitions, self._compression, needed, tried
-        )
+    def _acquire(
+        self, window: slice, periods: NDArray[np.float64], needed: int, tried: int, most_spread: float
+    ) -> Lock | None:
+        t, polarity = self._t[window], self._polarity[window]
+        return acquire(t, polarity, periods, self._transitions, self._compression, needed, tried, most_spread)
 
     def _choose(self, found: RateSearch, now: float, first: int, stop: int, lock: Lock | None) -> Lock | None:
         """Return the lock to follow.
@@ -271,7 +290,8 @@ class SequenceDemodulator:
         A fast rate finds short frames in one character of a slow signal, with idle line between them: where the words
         leave much of the time unexplained, the slower searches are asked first.
         """
-        slower = [search for search in self._searches if search.period > found.period]
+        # That a rate is listed says enough: blind searches are not asked about it.
+        slower = [s for s in self._searches if s.period > found.period and isinstance(s, type(found))]
         if lock is None or not slower or lock.verdict.full:
             return lock
         if not all(search.had_a_chance(now) for search in slower):

@@ -25,7 +25,7 @@ from beacon_comm.core.bit_clock import (
     go_on,
     take_events,
 )
-from beacon_comm.core.likelihood import CONTEXTS, COUNTS, LEVELS, MEMORY_BITS, learn, logarithms, weigh
+from beacon_comm.core.likelihood import CONTEXTS, COUNTS, LEVELS, MEMORY_BITS, SUB_SLOTS, learn, logarithms, weigh
 from beacon_comm.core.soft_decision import bit_ratios, margins
 from beacon_comm.core.trellis import NOISE_COST, UNLIKELY, framed_step, free_step
 
@@ -44,8 +44,12 @@ READABLE_MARGIN = 3.0
 LEAST_EVENTS = 0.1
 """A word with less than this share of the events that its bits should have is read into a silence: it is not given out.
 
-A start bit is a fall and the stop bits end in a rise, so that there is no word without events.
+A start bit is a fall and the stop bits end in a rise, so that there is no word without events, nor without ON events
+(a fall may go unseen far away).
 """
+
+RISES_WEIGHT = 3.0
+"""The ON events are at least a third of a word's."""
 
 MOST_MARGIN = 100.0
 """Margins are not told beyond this (nat)."""
@@ -106,7 +110,7 @@ class Detection(NamedTuple):
         free_metric, free_bits: of the free trellis, ``(CONTEXTS,)`` float64 and uint64 (last 64 bits of the path).
         metric, bits, ends, noises: of the framed trellis, ``(states,)`` float64 and uint64: the last 64 bits of the
             best path to the state, and for each of them whether it ended a frame or was noise.
-        likelihoods, counts, totals, borders, silent: of the last ``RING`` bits.
+        likelihoods, counts, totals, rises, borders, silent: of the last ``RING`` bits; rises are the ON events.
         numbers: see the constants above, ``(7,)`` int64.
     """
 
@@ -124,6 +128,7 @@ class Detection(NamedTuple):
     likelihoods: NDArray[np.float64]
     counts: NDArray[np.uint8]
     totals: NDArray[np.float64]
+    rises: NDArray[np.float64]
     borders: NDArray[np.float64]
     silent: NDArray[np.uint8]
     numbers: NDArray[np.int64]
@@ -164,6 +169,7 @@ def make_detection(
         likelihoods=np.zeros((RING, CONTEXTS)),
         counts=np.zeros((RING, COUNTS), np.uint8),
         totals=np.zeros(RING),
+        rises=np.zeros(RING),
         borders=np.zeros(RING),
         silent=np.zeros(RING, np.uint8),
         numbers=np.array([0, learnt, learnt + 1, 0, 0, 0, 0], np.int64),
@@ -255,6 +261,7 @@ def _close_bit(clock, state, transitions, layout, rows, count):  # type: ignore[
         scaled = int(n * per_gain + 0.5)
         counts[c] = compression[min(scaled, len(compression) - 1)]
     state.totals[place] = total
+    state.rises[place] = events[:SUB_SLOTS].sum()
     state.borders[place] = clock.values[BORDER]
     numbers[SILENT_RUN] = numbers[SILENT_RUN] + 1 if total == 0 else 0
     likelihoods = state.likelihoods[place]
@@ -380,13 +387,14 @@ def _decide_word(clock, state, layout, length, best, at, lag, row):  # type: ign
 
 @njit(cache=True, nogil=True)
 def _events_share(state, length, before, word, at):  # type: ignore[no-untyped-def]
-    """Return the events of a word as a share of those that its bits should have."""
-    seen, expected, context = 0.0, 1e-9, before
+    """Return the events of a word, ON and all, as a share of those that its bits should have."""
+    seen, rises, expected, context = 0.0, 0.0, 1e-9, before
     for k in range(length):
         context = (context << 1 | (word >> (length - 1 - k) & 1)) & (CONTEXTS - 1)
         seen += state.totals[(at - length + 1 + k) & _RING_MASK]
         expected += state.means[context] * state.levels[GAIN]
-    return seen / expected
+        rises += state.rises[(at - length + 1 + k) & _RING_MASK]
+    return min(seen, RISES_WEIGHT * rises) / expected
 
 
 @njit(cache=True, nogil=True)

@@ -34,7 +34,7 @@ IDLE_STAY_COST = 0.1
 NOISE_COST = 40.0
 """Price of giving the frame up (nat)."""
 
-NOISE_STAY_COST = 0.5
+NOISE_STAY_COST = 1.0
 """Price of each bit that is free (nat): more than a bit of a frame, that is free itself, should cost."""
 
 NOISE_EXIT_COST = 2.0
