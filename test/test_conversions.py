@@ -37,7 +37,8 @@ def character(code: int = ord('S'), track_id: int = 7, status: Status = Status.O
 def beacon(**changes: object) -> BeaconSnapshot:
     values: dict[str, object] = {
         'track_id': 3, 'state': BeaconState.CONFIRMED, 'quiet': False, 't_ns': 2**40, 'x_px': 100.5, 'y_px': 50.25,
-        'vx_px_per_s': 1.0, 'vy_px_per_s': -2.0, 'extent_px': 4.0, 'index': 6.0, 'bit_rate_bps': 504.0, 'bit_rate_std_bps': 0.01,
+        'vx_px_per_s': 1.0, 'vy_px_per_s': -2.0, 'extent_px': 4.0, 'index': 6.0, 'bit_rate_bps': 504.0,
+        'bit_rate_std_bps': 0.01,
         'confirmed_at_ns': 2**40, 'characters': 20, 'characters_ok': 18, 'parity_errors': 1, 'framing_errors': 1,
         'bearing': np.array([0.0, 0.6, 0.8]), 'azimuth_rad': 0.1, 'elevation_rad': -0.2, 'age_s': 0.03,
     }

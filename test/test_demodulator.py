@@ -165,7 +165,8 @@ def test_clock_may_start_anywhere(bit_rates):
 
 
 def test_one_listed_rate_is_settled_from_the_start():
-    for demodulator in (RateBank(Parameters(bit_rates=(1000.0,))), make_demodulator(Parameters(bit_rates=(1000.0,), receiver='threshold'))):
+    parameters = Parameters(bit_rates=(1000.0,), receiver='threshold')
+    for demodulator in (RateBank(parameters), make_demodulator(parameters)):
         assert demodulator.bit_rate_bps == 1000.0
         t_ns, polarity = line_events(text_bits('ab'), 1000.0)
         assert text_of(demodulator.push(t_ns, polarity, int(t_ns[-1]))) == 'a'

@@ -126,7 +126,6 @@ def test_attempts_follow_one_another_on_a_grid(search):
     assert not search.exhausted and search.due - 1e9 == pytest.approx(dues[0] - 7e6)
 
 
-@pytest.mark.xfail(strict=True, reason='attempts grow rarer without bound')
 def test_attempts_never_leave_more_out_than_can_be_read_back():
     # A beacon that begins after an hour of something else is found before its first characters are forgotten.
     search = ListedSearch(1000.0, FRAME)

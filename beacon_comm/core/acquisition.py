@@ -225,7 +225,10 @@ def _read(
     if inverted:
         latency.reverse()
     clock = make_clock(border, period, (latency[0], latency[1]), fit[3], max(fit[4], 1e-5))
-    detection = make_detection(histograms, means, gain, silence, verdict.passing, compression, transitions.states)
+    usual = likelihood / bits
+    detection = make_detection(
+        histograms, means, gain, silence, usual, verdict.passing, compression, transitions.states
+    )
     return Lock(clock, detection, inverted, verdict, period, path // (2 * CONTEXTS))
 
 

@@ -46,6 +46,9 @@ BLIND_ATTEMPTS = (12, 16, 20, 25)
 LATER_STEP, LATER_SHARE = 6, 0.4
 """… and then after so many more, or after this share of all so far if that is more."""
 
+MOST_STEP, BLIND_STEP_NS = 50.0, 0.5 * NS_PER_S
+"""Attempts are at most so many characters apart, so that nothing is out of reach; blind ones, that cost more, or so long."""
+
 BLIND_OCTAVES = (5000.0, 2500.0, 1250.0, 625.0, 312.5, 156.25, 100.0)
 """Slowest rate of each octave (bit/s), the fast ones first."""
 
@@ -96,6 +99,7 @@ class RateSearch:
         needed: words that have to pass.
         tried: periods of each group that are read, those with the widest eye.
         most_spread: of the edges about the bit grid (bit) up to which a lock is believed.
+        most_step: attempts are at most so many characters apart.
         longest: events so far back may still be needed (ns).
     """
 
@@ -107,6 +111,7 @@ class RateSearch:
         self._attempts = attempts
         self.tried = TRIED
         self.most_spread = EDGE_SPREAD
+        self.most_step = MOST_STEP
         self.longest = KEPT_CHARACTERS * self._character
         self.restart(0.0)
 
@@ -157,7 +162,7 @@ class RateSearch:
         if self._made < len(self._attempts):
             self._at = float(self._attempts[self._made])
         else:
-            self._at += max(LATER_STEP, self._at * LATER_SHARE)
+            self._at += min(max(LATER_STEP, self._at * LATER_SHARE), self.most_step)
 
 
 class ListedSearch(RateSearch):
@@ -178,6 +183,7 @@ class OctaveSearch(RateSearch):
     def __init__(self, slowest_bps: float, frame: CharacterFrame) -> None:
         super().__init__(slowest_bps, frame, BLIND_NEEDED, BLIND_ATTEMPTS)
         self.tried = 1
+        self.most_step = max(MOST_STEP, BLIND_STEP_NS / self._character)
 
     def periods(self, t: NDArray[np.float64], polarity: NDArray[np.int8]) -> Iterator[NDArray[np.float64]]:
         """Yield the surroundings of the periods that autocorrelation and spectra name."""

@@ -41,6 +41,9 @@ OK_MARGIN = 4.0
 READABLE_MARGIN = 3.0
 """A word with an erased bit that beats the next one by less (nat) is not given out: it would be invented."""
 
+LEAST_FIT = 8.0
+"""A word whose bits are so much less likely (nat a bit) than usual is not ok: other light, and noise, can look like bits."""
+
 LEAST_EVENTS = 0.1
 """A word with less than this share of the events that its bits should have is read into a silence: it is not given out.
 
@@ -87,7 +90,7 @@ UNKNOWN_PLACE_COST = 8.0
 RING = 64
 _RING_MASK = RING - 1
 
-GAIN, SILENCE = range(2)
+GAIN, SILENCE, USUAL = range(3)
 
 # Whole numbers of the state.
 BIT, LEARNT, NEXT_TABLES, NOISE_RUN, DOUBT, SILENT_RUN, ASLEEP = range(7)
@@ -104,8 +107,8 @@ class Detection(NamedTuple):
     Attributes:
         histograms, tables: see :mod:`beacon_comm.core.likelihood`, ``(CONTEXTS, COUNTS, LEVELS)`` float64.
         means: events of a bit for each context, after the gain, ``(CONTEXTS,)`` float64.
-        levels: ``(2,)`` float64: the gain, by which counts are divided before they are compressed, and the share of
-            silent bits in words.
+        levels: ``(3,)`` float64: the gain, by which counts are divided before they are compressed, the share of
+            silent bits in words, and the mean log p of a word's bit (nat).
         compression: see :func:`beacon_comm.core.likelihood.compression_table`.
         free_metric, free_bits: of the free trellis, ``(CONTEXTS,)`` float64 and uint64 (last 64 bits of the path).
         metric, bits, ends, noises: of the framed trellis, ``(states,)`` float64 and uint64: the last 64 bits of the
@@ -139,6 +142,7 @@ def make_detection(
     means: NDArray[np.float64],
     gain: float,
     silence: float,
+    usual: float,
     learnt: int,
     compression: NDArray[np.uint8],
     states: int,
@@ -147,7 +151,7 @@ def make_detection(
 
     Args:
         histograms, means: learnt while the lock was sought.
-        gain, silence: see :class:`Detection`.
+        gain, silence, usual: see :class:`Detection`.
         learnt: number of words in the histograms.
         compression: table of compressed counts.
         states: of the framed trellis.
@@ -158,7 +162,7 @@ def make_detection(
         histograms=histograms,
         tables=tables,
         means=means,
-        levels=np.array([gain, silence]),
+        levels=np.array([gain, silence, usual]),
         compression=compression,
         free_metric=np.zeros(CONTEXTS),
         free_bits=np.zeros(CONTEXTS, np.int64),
@@ -252,7 +256,7 @@ def _close_bit(clock, state, transitions, layout, rows, count):  # type: ignore[
     numbers = state.numbers
     place = numbers[BIT] & _RING_MASK
     counts, compression, events = state.counts[place], state.compression, clock.counts
-    gain, silence = state.levels
+    gain, silence = state.levels[GAIN], state.levels[SILENCE]
     per_gain = 1.0 / gain
     total = 0
     for c in range(COUNTS):
@@ -368,10 +372,12 @@ def _decide_word(clock, state, layout, length, best, at, lag, row):  # type: ign
             other = max(other, metric[to])
             metric[to] = UNLIKELY
     margin = min(word_margin, agreeing - other, MOST_MARGIN)
+    fit = _fit_of(likelihoods, length, before, word)
     if _events_share(state, length, before, word, at) < LEAST_EVENTS:
         row[WORD], row[KIND] = word, KIND_UNREADABLE
         return
-    passes = frame_margin >= OK_FRAME_MARGIN or (word == free and not erased)
+    alike = fit >= state.levels[USUAL] - LEAST_FIT
+    passes = alike and (frame_margin >= OK_FRAME_MARGIN or (word == free and not erased))
     ok = passes and margin >= OK_MARGIN
     if passes:
         numbers[DOUBT] = max(0, numbers[DOUBT] - length)
@@ -379,10 +385,22 @@ def _decide_word(clock, state, layout, length, best, at, lag, row):  # type: ign
         numbers[DOUBT] += length
     if passes or word_margin >= LEARNING_MARGIN:
         _learn_word(state, length, before, word, at)
+        if not erased:
+            state.levels[USUAL] += (fit - state.levels[USUAL]) / LEARNING_MEMORY
     clock.numbers[FROZEN] = 0 if passes else 1
     row[WORD], row[MARGIN], row[PERIOD_THEN] = word, margin, clock.values[PERIOD]
     row[KIND] = KIND_OK if ok else KIND_UNREADABLE if erased and margin < READABLE_MARGIN else KIND_REPAIRED
     row[BORDER_OF_START] = state.borders[(at - length + 1) & _RING_MASK]
+
+
+@njit(cache=True, nogil=True)
+def _fit_of(likelihoods, length, before, word):  # type: ignore[no-untyped-def]
+    """Return the mean log p of the bits of a word (nat)."""
+    total, context = 0.0, before
+    for k in range(length):
+        context = (context << 1 | (word >> (length - 1 - k) & 1)) & (CONTEXTS - 1)
+        total += likelihoods[k, context]
+    return total / length
 
 
 @njit(cache=True, nogil=True)
