@@ -24,7 +24,8 @@ COMPRESSION = compression_table()
 
 def found(events, periods, needed=4, transitions=TRANSITIONS):
     t_ns, polarity = events
-    return acquire((t_ns - t_ns[0]).astype(np.float64), polarity, np.asarray(periods), transitions, COMPRESSION, needed, 3, EDGE_SPREAD)
+    t = (t_ns - t_ns[0]).astype(np.float64)
+    return acquire(t, polarity, np.asarray(periods), transitions, COMPRESSION, needed, 3, EDGE_SPREAD)
 
 
 def beacon(text, bit_rate_bps, skipped=0, ends_after=5, frame=None, **options):

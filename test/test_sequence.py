@@ -264,7 +264,6 @@ def test_a_beacon_of_another_rate_than_the_listed_one_is_not_read(listed):
 
 
 @pytest.mark.parametrize('rates', [(252.0, 504.0), (504.0, 1008.0)])
-@BESIDE
 def test_half_and_double_the_rate_may_be_listed(rates):
     for skipped in range(0, 22, 3):
         t_ns, polarity = beacon_events(text_bits(PROSE)[skipped:], 504.0, lead_s=0.0)
