@@ -72,9 +72,9 @@ def decode(
     return Decoded(characters, paths, tuple(sorted(ever_confirmed)))
 
 
-def read(decoded: Decoded, track_id: int) -> list[tuple[int, int]]:
-    """Return codes and statuses; times are left out, since an edge may shift by microseconds."""
-    return [(code, status) for _, code, status in decoded.characters[track_id]]
+def read(decoded: Decoded, track_id: int) -> list[int]:
+    """Return codes; times are left out, since an edge may shift by microseconds, and statuses: light beside it is doubt."""
+    return [code for _, code, _ in decoded.characters[track_id]]
 
 
 def rms_px(path: list[tuple[int, float, float]], beacon: Beacon) -> float:

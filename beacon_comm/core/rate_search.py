@@ -61,6 +61,9 @@ BINS_PER_BIT = 4
 EDGE_SPREAD = 0.22
 """Edges spread farther about the bit grid (bit) are those of another rate: the recordings' have 0.07 to 0.16."""
 
+TRUSTED_SHARE = 0.7
+"""Words of a listed rate that cover so much of a window need no sharp edges."""
+
 COMB = 8
 """Multiples of a character's duration that are summed."""
 
@@ -99,6 +102,7 @@ class RateSearch:
         needed: words that have to pass.
         tried: periods of each group that are read, those with the widest eye.
         most_spread: of the edges about the bit grid (bit) up to which a lock is believed.
+        trusted_share: see :func:`beacon_comm.core.acquisition.acquire`.
         most_step: attempts are at most so many characters apart.
         longest: events so far back may still be needed (ns).
     """
@@ -111,6 +115,7 @@ class RateSearch:
         self._attempts = attempts
         self.tried = TRIED
         self.most_spread = EDGE_SPREAD
+        self.trusted_share = TRUSTED_SHARE
         self.most_step = MOST_STEP
         self.longest = KEPT_CHARACTERS * self._character
         self.restart(0.0)
@@ -183,6 +188,7 @@ class OctaveSearch(RateSearch):
     def __init__(self, slowest_bps: float, frame: CharacterFrame) -> None:
         super().__init__(slowest_bps, frame, BLIND_NEEDED, BLIND_ATTEMPTS)
         self.tried = 1
+        self.trusted_share = math.inf
         self.most_step = max(MOST_STEP, BLIND_STEP_NS / self._character)
 
     def periods(self, t: NDArray[np.float64], polarity: NDArray[np.int8]) -> Iterator[NDArray[np.float64]]:

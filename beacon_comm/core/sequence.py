@@ -25,7 +25,7 @@ from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.likelihood import MEMORY_BITS, compression_table
 from beacon_comm.core.parameters import Parameters
-from beacon_comm.core.rate_search import EDGE_SPREAD, READ_BACK_CHARACTERS, TRIED, RateSearch, make_searches
+from beacon_comm.core.rate_search import READ_BACK_CHARACTERS, TRIED, RateSearch, make_searches
 from beacon_comm.core.sequence_detection import (
     BORDER_OF_START,
     FIRST_RATIO,
@@ -183,7 +183,15 @@ class SequenceDemodulator:
         first = int(np.searchsorted(self._t, self._refine_at - REFINED_AFTER * self._frame.length * period))
         self._refine_at = math.inf
         window = slice(first, stop)
-        better = self._acquire(window, period * REFINED_PERIODS, REFINED_AFTER // 2, TRIED, EDGE_SPREAD)
+        better = acquire(
+            self._t[window],
+            self._polarity[window],
+            period * REFINED_PERIODS,
+            self._transitions,
+            self._compression,
+            REFINED_AFTER // 2,
+            TRIED,
+        )
         if better is not None and better.inverted == lock.inverted:
             self._begin(better, max(self._given_to - 2.0 * self._frame.length * period, float(self._t[first])))
 
@@ -273,16 +281,23 @@ class SequenceDemodulator:
     def _look(self, search: RateSearch, window: slice) -> Lock | None:
         t, polarity = self._t[window], self._polarity[window]
         for periods in search.periods(t, polarity):
-            lock = self._acquire(window, periods, search.needed, search.tried, search.most_spread)
+            lock = self._acquire(window, periods, search)
             if lock is not None:
                 return lock
         return None
 
-    def _acquire(
-        self, window: slice, periods: NDArray[np.float64], needed: int, tried: int, most_spread: float
-    ) -> Lock | None:
-        t, polarity = self._t[window], self._polarity[window]
-        return acquire(t, polarity, periods, self._transitions, self._compression, needed, tried, most_spread)
+    def _acquire(self, window: slice, periods: NDArray[np.float64], search: RateSearch) -> Lock | None:
+        return acquire(
+            self._t[window],
+            self._polarity[window],
+            periods,
+            self._transitions,
+            self._compression,
+            search.needed,
+            search.tried,
+            search.most_spread,
+            search.trusted_share,
+        )
 
     def _choose(self, found: RateSearch, now: float, first: int, stop: int, lock: Lock | None) -> Lock | None:
         """Return the lock to follow.
