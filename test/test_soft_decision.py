@@ -101,5 +101,5 @@ def test_no_evidence_is_no_margin():
 def test_confidence_grows_with_the_margin():
     confidences = [confidence_of(margin) for margin in (0.0, 1.0, 3.0, 8.0, 15.0, 30.0)]
     assert confidences == sorted(set(confidences))
-    assert 0.0 < confidences[0] < 0.5 and 0.95 < confidences[3] < 0.99 and 0.998 < confidences[5] < 1.0
+    assert 0.0 < confidences[0] < 0.5 and 0.9 < confidences[3] < 0.99 and 0.998 < confidences[5] < 1.0
     assert confidence_of(-5.0) == confidences[0] and confidence_of(1e3) == confidences[5]

@@ -146,7 +146,7 @@ def acquire(
     needed: int,
     tried: int,
     most_spread: float = 1.0,
-    trusted_share: float = 0.0,
+    trusted_share: float = 2.0,
 ) -> Lock | None:
     """Look for a beacon in a window of events.
 
@@ -160,8 +160,8 @@ def acquire(
         tried: so many of the periods are read, those with the widest eye.
         most_spread: standard deviation of the edges about the bit grid (bit) up to which a lock is believed; evenly
             spread edges, of another rate, have 0.29.
-        trusted_share: share of the window covered by passing words from which on the edges do not matter: background
-            events hide them.
+        trusted_share: share of the window covered by passing words, no fewer than 8, from which on the edges do not matter:
+            background events hide them.
     """
     if len(t) < EDGE_RUN * needed:
         return None
@@ -172,7 +172,8 @@ def acquire(
         lock = _read(t, polarity, start, stop, float(periods[k]), transitions, compression, needed)
         if lock is None or lock.verdict.passing < needed or not lock.verdict.convinces:
             continue
-        if lock.verdict.spread > most_spread and lock.verdict.share < trusted_share:
+        trusted = lock.verdict.share >= trusted_share and lock.verdict.passing >= FULL_WORDS
+        if lock.verdict.spread > most_spread and not trusted:
             continue
         if found is None or _merit(lock.verdict) > _merit(found.verdict):
             found = lock
