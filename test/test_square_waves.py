@@ -45,7 +45,7 @@ def read(events: tuple[np.ndarray, np.ndarray], parameters: Parameters) -> list[
 @pytest.mark.parametrize('bit_rate_bps', RATES_BPS)
 @pytest.mark.parametrize('model', [EDGES, SHARP, BLURRED], ids=['edges', 'sharp', 'blurred'])
 def test_a_lamp_read_at_any_rate_is_not_confirmed(bit_rate_bps: float, model: LedModel) -> None:
-    parameters = Parameters(bit_rates=(bit_rate_bps,))
+    parameters = Parameters(bit_rates=(bit_rate_bps,), receiver='threshold')
     total = 0
     rational = [f for f in (bit_rate_bps / 11 / frames for frames in FRAMES) if 50.0 <= f <= 1000.0]
     for frequency_hz, duty in itertools.product([*FREQUENCIES_HZ, *rational], DUTIES[:: 1 if bit_rate_bps > 100 else 3]):
@@ -58,14 +58,14 @@ def test_a_lamp_read_at_any_rate_is_not_confirmed(bit_rate_bps: float, model: Le
 
 @pytest.mark.parametrize(('frequency_hz', 'duty'), [(100.0, 0.5), (120.0, 0.5), (240.0, 0.3), (871.2, 0.6)])
 def test_a_lamp_is_not_confirmed_when_all_rates_are_tried(frequency_hz: float, duty: float) -> None:
-    parameters = Parameters(bit_rates=(100.0, 504.0, 1000.0, 3125.0, 10_000.0))
+    parameters = Parameters(bit_rates=(100.0, 504.0, 1000.0, 3125.0, 10_000.0), receiver='threshold')
     events = square_wave(frequency_hz, duty, 3.0, t0_ns=T0_NS, model=SHARP)
     assert confirmations(read(events, parameters), parameters) == 0
 
 
 @pytest.mark.parametrize('bit_rate_bps', [100.0, 504.0, 3125.0])
 def test_a_beacon_seen_through_the_same_model_is_confirmed(bit_rate_bps: float) -> None:
-    parameters = Parameters(bit_rates=(bit_rate_bps,))
+    parameters = Parameters(bit_rates=(bit_rate_bps,), receiver='threshold')
     text = "Shall I compare thee to a summer's day?\nThou art more lovely"
     events = simulate_text(text, bit_rate_bps, t0_ns=T0_NS, model=SHARP)
     assert confirmations(read(events, parameters), parameters) >= 1
@@ -73,14 +73,14 @@ def test_a_beacon_seen_through_the_same_model_is_confirmed(bit_rate_bps: float) 
 
 @pytest.mark.parametrize('events_per_bit', [1.0, 10.0, 100.0])
 def test_noise_is_not_confirmed(events_per_bit: float) -> None:
-    parameters = Parameters(bit_rates=(504.0,))
+    parameters = Parameters(bit_rates=(504.0,), receiver='threshold')
     events = noise(events_per_bit * 504.0, 20.0, t0_ns=T0_NS, seed=3)
     assert confirmations(read(events, parameters), parameters) == 0
 
 
 def test_a_lamp_that_reads_as_valid_characters_makes_room_for_a_beacon() -> None:
     """One slot, a 120 Hz lamp that parity never fails, and a beacon of lower index."""
-    parameters = Parameters(bit_rates=(504.0,), candidate_slots=1)
+    parameters = Parameters(bit_rates=(504.0,), candidate_slots=1, receiver='threshold')
     streams = {
         1: square_wave(120.0, 0.5, 6.0, t0_ns=T0_NS, model=SHARP),
         2: simulate_text('It reads as 0 0000111 1 11 for ever. ' * 8, 504.0, t0_ns=T0_NS, model=SHARP),
