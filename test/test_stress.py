@@ -38,6 +38,7 @@ from beacon_comm.simulation.stress import (
 TEXT = 'A beacon of one line. '
 SECOND = 1_000_000_000
 BIT_RATE_BPS = 500.0
+THRESHOLD = Parameters(receiver='threshold')
 BIT_NS = 2_000_000
 
 
@@ -287,7 +288,7 @@ def test_every_stress_starts_from_none_and_is_counted(stress, waveform) -> None:
     severity = max(stress.severities, key=lambda severity: abs(severity - stress.none))
     made = stress_command.apply(stress.name, severity, waveform, other)
     assert not np.array_equal(made.t_ns, waveform.t_ns)
-    count = stress_command.count_of(stress, severity, waveform, made, 'threshold', Parameters(), TEXT * 3)
+    count = stress_command.count_of(stress, severity, waveform, made, 'threshold', THRESHOLD, TEXT * 3)
     assert count.characters == len(TEXT) * 3
     assert count.wrong >= count.missing + count.inserted
     assert 0 <= count.missing <= count.characters
@@ -302,10 +303,10 @@ def test_what_was_sent_is_looked_up_on_the_sender_s_clock(name, waveform) -> Non
     """2 % off over a text is many characters: without the way back hardly any would be in its place."""
     (stress,) = stress_command.chosen_stresses([name])
     made = stress_command.apply(name, 2.0, waveform, OTHER)
-    count = stress_command.count_of(stress, 2.0, waveform, made, 'threshold', Parameters(), TEXT * 3)
+    count = stress_command.count_of(stress, 2.0, waveform, made, 'threshold', THRESHOLD, TEXT * 3)
     assert count.wrong < 0.2 * count.characters
     lost = replace(made, warp=None)
-    assert stress_command.count_of(stress, 2.0, waveform, lost, 'threshold', Parameters(), TEXT * 3).wrong > count.wrong
+    assert stress_command.count_of(stress, 2.0, waveform, lost, 'threshold', THRESHOLD, TEXT * 3).wrong > count.wrong
 
 
 def test_the_recordings_score_as_without_stress(data_folder) -> None:
@@ -314,7 +315,7 @@ def test_the_recordings_score_as_without_stress(data_folder) -> None:
     waveform = stress_command.recorded(path, SONNET18, Parameters())
     (stress,) = stress_command.chosen_stresses(['thinned'])
     made = stress_command.apply('thinned', 100.0, waveform, OTHER)
-    count = stress_command.count_of(stress, 100.0, waveform, made, 'threshold', Parameters(), SONNET18)
+    count = stress_command.count_of(stress, 100.0, waveform, made, 'threshold', THRESHOLD, SONNET18)
     assert count.wrong == sum(transmission.wrong for transmission in waveform.sent)
     assert count.characters == sum(transmission.characters for transmission in waveform.sent)
 
