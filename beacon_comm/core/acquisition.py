@@ -198,12 +198,12 @@ def _read(
     for _ in range(2):
         _fit_edges(t, polarity, start, period, fit)
         period *= 1.0 + fit[0]
-    border = start + (_phase(_folded(t, polarity, start, period, stop)) - 1.0) * period
+    border = start + (_phase(_eye(_fine(t, polarity, start, period, stop))) - 1.0) * period
     bits = int((stop - border) / period) + 1
     raw = _counts(t, polarity, border, period, bits)
     gain = max(1.0, raw.sum() / bits / REFERENCE_EVENTS)
     counts = compression[np.minimum((raw / gain + 0.5).astype(np.int64), len(compression) - 1)]
-    histograms, likelihoods, free = _learn_free(raw, counts)
+    likelihoods, free = _learn_free(raw, counts)
     path, likelihood = framed_path(transitions, likelihoods)
     other_path, other_likelihood = framed_path(transitions, likelihoods[:, ::-1].copy())
     inverted = other_likelihood > likelihood
@@ -225,7 +225,7 @@ def _read(
     means = _means(raw / gain, path)
     silence = float(np.mean(raw.sum(axis=1)[framed] < SILENT_SHARE * gain * means.mean())) if len(framed) else 1.0
     # Latencies of the edges behind the borders, of which the fold knows only the fraction of a bit.
-    latency = [((fit[k] * 1.0 - (border - start) / period + 0.3) % 1.0 - 0.3) * period for k in (1, 2)]
+    latency = [((fit[k] - (border - start) / period + 0.3) % 1.0 - 0.3) * period for k in (1, 2)]
     if inverted:
         latency.reverse()
     clock = make_clock(border, period, (latency[0], latency[1]), fit[3], max(fit[4], 1e-5))
@@ -265,11 +265,6 @@ def _eyes(t, polarity, start, periods, stop):  # type: ignore[no-untyped-def]
     for k in range(len(periods)):
         best[k] = _eye(_fine(t, polarity, start, periods[k], stop)).max()
     return best
-
-
-@njit(cache=True, nogil=True)
-def _folded(t, polarity, start, period, stop):  # type: ignore[no-untyped-def]
-    return _eye(_fine(t, polarity, start, period, stop))
 
 
 @njit(cache=True, nogil=True)
@@ -315,16 +310,15 @@ def _fit_edges(t, polarity, start, period, fit):  # type: ignore[no-untyped-def]
                 s += np.sin(2.0 * np.pi * edges[i])
         fit[1 + kind] = np.arctan2(s, c) / (2.0 * np.pi)
     mean_x = edges[:count].mean()
-    xy, xx, used, squares = 0.0, 0.0, 0, 0.0
+    xy, xx, squares = 0.0, 0.0, 0.0
     for i in range(count):
         off = edges[i] - fit[1 if rising[i] else 2]
         residual = off - np.floor(off + 0.5)
         xy += (edges[i] - mean_x) * residual
         xx += (edges[i] - mean_x) ** 2
         squares += residual * residual
-        used += 1
     slope = xy / xx if xx > 0.0 else 0.0
-    spread = np.sqrt(max(squares / used, 1e-6))
+    spread = np.sqrt(max(squares / count, 1e-6))
     fit[0] = slope
     fit[3] = spread
     fit[4] = spread / np.sqrt(xx) if xx > 0.0 else 0.01
@@ -378,16 +372,15 @@ def _weigh_all(tables, counts):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _learn_free(raw, counts):  # type: ignore[no-untyped-def]
-    """Learn from the counts alone, without the frame; return histograms, log p ``(bits, CONTEXTS)``, and bits."""
+    """Learn from the counts alone, without the frame; return log p ``(bits, CONTEXTS)``, and bits."""
     tables = np.empty((CONTEXTS, COUNTS, LEVELS))
+    likelihoods = np.empty((len(counts), CONTEXTS))
     bits = _slice(raw)
-    histograms = _learn_from(counts, bits, tables)
-    likelihoods = _weigh_all(tables, counts)
-    for _ in range(FREE_ROUNDS):
-        bits = free_bits(likelihoods)
-        histograms = _learn_from(counts, bits, tables)
+    for _ in range(FREE_ROUNDS + 1):  # first from the slicer's bits
+        _learn_from(counts, bits, tables)
         likelihoods = _weigh_all(tables, counts)
-    return histograms, likelihoods, free_bits(likelihoods)
+        bits = free_bits(likelihoods)
+    return likelihoods, bits
 
 
 @njit(cache=True, nogil=True)

@@ -110,8 +110,8 @@ class Detection(NamedTuple):
         levels: ``(3,)`` float64: the gain, by which counts are divided before they are compressed, the share of
             silent bits in words, and the mean log p of a word's bit (nat).
         compression: see :func:`beacon_comm.core.likelihood.compression_table`.
-        free_metric, free_bits: of the free trellis, ``(CONTEXTS,)`` float64 and uint64 (last 64 bits of the path).
-        metric, bits, ends, noises: of the framed trellis, ``(states,)`` float64 and uint64: the last 64 bits of the
+        free_metric, free_bits: of the free trellis, ``(CONTEXTS,)`` float64 and int64 (last 64 bits of the path).
+        metric, bits, ends, noises: of the framed trellis, ``(states,)`` float64 and int64: the last 64 bits of the
             best path to the state, and for each of them whether it ended a frame or was noise.
         likelihoods, counts, totals, rises, borders, silent: of the last ``RING`` bits; rises are the ON events.
         numbers: see the constants above, ``(7,)`` int64.
@@ -372,8 +372,15 @@ def _decide_word(clock, state, layout, length, best, at, lag, row):  # type: ign
             other = max(other, metric[to])
             metric[to] = UNLIKELY
     margin = min(word_margin, agreeing - other, MOST_MARGIN)
-    fit = _fit_of(likelihoods, length, before, word)
-    if _events_share(state, length, before, word, at) < LEAST_EVENTS:
+    contexts = np.empty(length, np.int64)
+    context, fit = before, 0.0
+    for k in range(length):
+        context = (context << 1 | (word >> (length - 1 - k) & 1)) & (CONTEXTS - 1)
+        contexts[k] = context
+        fit += likelihoods[k, context]
+    fit /= length
+    first = at - length + 1
+    if _events_share(state, contexts, first) < LEAST_EVENTS:
         row[WORD], row[KIND] = word, KIND_UNREADABLE
         return
     alike = fit >= state.levels[USUAL] - LEAST_FIT
@@ -384,7 +391,7 @@ def _decide_word(clock, state, layout, length, best, at, lag, row):  # type: ign
     elif not erased:
         numbers[DOUBT] += length
     if passes or word_margin >= LEARNING_MARGIN:
-        _learn_word(state, length, before, word, at)
+        _learn_word(state, contexts, first)
         if not erased:
             state.levels[USUAL] += (fit - state.levels[USUAL]) / LEARNING_MEMORY
     clock.numbers[FROZEN] = 0 if passes else 1
@@ -394,30 +401,20 @@ def _decide_word(clock, state, layout, length, best, at, lag, row):  # type: ign
 
 
 @njit(cache=True, nogil=True)
-def _fit_of(likelihoods, length, before, word):  # type: ignore[no-untyped-def]
-    """Return the mean log p of the bits of a word (nat)."""
-    total, context = 0.0, before
-    for k in range(length):
-        context = (context << 1 | (word >> (length - 1 - k) & 1)) & (CONTEXTS - 1)
-        total += likelihoods[k, context]
-    return total / length
-
-
-@njit(cache=True, nogil=True)
-def _events_share(state, length, before, word, at):  # type: ignore[no-untyped-def]
-    """Return the events of a word, ON and all, as a share of those that its bits should have."""
-    seen, rises, expected, context = 0.0, 0.0, 1e-9, before
-    for k in range(length):
-        context = (context << 1 | (word >> (length - 1 - k) & 1)) & (CONTEXTS - 1)
-        seen += state.totals[(at - length + 1 + k) & _RING_MASK]
-        expected += state.means[context] * state.levels[GAIN]
-        rises += state.rises[(at - length + 1 + k) & _RING_MASK]
+def _events_share(state, contexts, first):  # type: ignore[no-untyped-def]
+    """Return the events of a word from the bit ``first`` on, ON and all, as a share of those that its bits should have."""
+    seen, rises, expected = 0.0, 0.0, 1e-9
+    for k in range(len(contexts)):
+        place = (first + k) & _RING_MASK
+        seen += state.totals[place]
+        expected += state.means[contexts[k]] * state.levels[GAIN]
+        rises += state.rises[place]
     return min(seen, RISES_WEIGHT * rises) / expected
 
 
 @njit(cache=True, nogil=True)
-def _learn_word(state, length, before, word, at):  # type: ignore[no-untyped-def]
-    """Learn from a word that is ok, and follow the amplitude."""
+def _learn_word(state, contexts, first):  # type: ignore[no-untyped-def]
+    """Learn from a word from the bit ``first`` on, and follow the amplitude."""
     numbers = state.numbers
     histograms, counts, means = state.histograms, state.counts, state.means
     levels, silent, totals = state.levels, state.silent, state.totals
@@ -427,11 +424,9 @@ def _learn_word(state, length, before, word, at):  # type: ignore[no-untyped-def
             for level in range(LEVELS):
                 histograms[c, d, level] *= fading
     seen, expected = 0.0, 0.0
-    context = before
-    for k in range(length):
-        context = (context << 1 | (word >> (length - 1 - k) & 1)) & (CONTEXTS - 1)
-        place = (at - length + 1 + k) & _RING_MASK
-        levels[SILENCE] += (silent[place] - levels[SILENCE]) / (LEARNING_MEMORY * length)
+    for k in range(len(contexts)):
+        context, place = contexts[k], (first + k) & _RING_MASK
+        levels[SILENCE] += (silent[place] - levels[SILENCE]) / (LEARNING_MEMORY * len(contexts))
         if silent[place] and levels[SILENCE] < RARELY_SILENT:
             continue
         learn(histograms, counts[place], context, 1.0)
@@ -452,6 +447,6 @@ def end_detection(clock, state, transitions, layout, rows):  # type: ignore[no-u
     """Decide what is still open, as if nothing more came; return the number of rows."""
     count = 0
     best = np.argmax(state.metric)
-    for delay in range(DELAY_FRAMES * transitions.length - 1, -1, -1):
-        count = _decide(clock, state, transitions, layout, best, delay, rows, count)
+    for lag in range(DELAY_FRAMES * transitions.length - 1, -1, -1):
+        count = _decide(clock, state, transitions, layout, best, lag, rows, count)
     return count
