@@ -32,6 +32,7 @@ from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.threshold import (
     GivenOnce,
+    GivenRate,
     Reading,
     ThresholdDemodulator,
     covered_ns,
@@ -129,7 +130,7 @@ class _Rate:
         return explained, len(fresh)
 
 
-class RateBank:
+class RateBank(GivenRate):
     """Demodulates at all listed rates until one is settled, then at that one.
 
     Args:
@@ -149,16 +150,6 @@ class RateBank:
     def bit_rate_bps(self) -> float | None:
         """The settled bit rate (bit/s), None before."""
         return None if self._settled is None else self._settled.bit_rate_bps
-
-    @property
-    def bit_rate_std_bps(self) -> float | None:
-        """None: the rates are given, not estimated."""
-        return None
-
-    @property
-    def given_up(self) -> bool:
-        """False: it decides nothing, the parity record does."""
-        return False
 
     def push(self, t_ns: NDArray[np.int64], polarity: NDArray[np.int8], t_end_ns: int) -> list[Character]:
         """Take the next events; see :class:`beacon_comm.core.demodulator.Demodulator`."""

@@ -74,7 +74,21 @@ class GivenOnce:
         return characters
 
 
-class ThresholdDemodulator:
+class GivenRate:
+    """What the demodulators have in common that are told the bit rate, and leave it to the parity record to judge."""
+
+    @property
+    def bit_rate_std_bps(self) -> float | None:
+        """None: the rate is given, not estimated."""
+        return None
+
+    @property
+    def given_up(self) -> bool:
+        """False: it decides nothing, the parity record does."""
+        return False
+
+
+class ThresholdDemodulator(GivenRate):
     """The paper's demodulator at one bit rate; characters go out as soon as they are decided.
 
     Args:
@@ -98,16 +112,6 @@ class ThresholdDemodulator:
     def bit_rate_bps(self) -> float:
         """The one bit rate (bit/s)."""
         return self._bit_rate_bps
-
-    @property
-    def bit_rate_std_bps(self) -> float | None:
-        """None: the rate is given, not estimated."""
-        return None
-
-    @property
-    def given_up(self) -> bool:
-        """False: it decides nothing, the parity record does."""
-        return False
 
     def push(self, t_ns: NDArray[np.int64], polarity: NDArray[np.int8], t_end_ns: int) -> list[Character]:
         """Take the next events; see :class:`beacon_comm.core.demodulator.Demodulator`."""
