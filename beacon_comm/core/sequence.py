@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from beacon_comm.core.acquisition import Lock, acquire
 from beacon_comm.core.bit_clock import BORDER, P_PERIOD, PERIOD
 from beacon_comm.core.character import Character, Status
+from beacon_comm.core.event_buffer import EVENT_BYTES
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.likelihood import MEMORY_BITS, compression_table
@@ -72,7 +73,7 @@ class SequenceDemodulator:
         self._decode = self._frame.decoding_table()
         self._compression = compression_table()
         self._searches: list[RateSearch] = make_searches(parameters, self._frame)
-        self._most_events = parameters.buffer_max_bytes // 9
+        self._most_events = parameters.buffer_max_bytes // EVENT_BYTES
         self._rows = np.zeros((_ROWS, FIRST_RATIO + self._frame.length))
         self._lock: Lock | None = None
         self._ended: Lock | None = None  # the lock at the stream's end

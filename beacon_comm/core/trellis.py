@@ -16,6 +16,7 @@ light or an unknown sender leads, so that no character has to be read into them.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -61,8 +62,9 @@ class Transitions(NamedTuple):
     length: int
 
 
+@lru_cache(maxsize=16)
 def framed_transitions(frame: CharacterFrame) -> Transitions:
-    """Return the framed trellis of a character frame."""
+    """Return the framed trellis of a character frame; computed once for equal layouts, nobody writes to it."""
     length = frame.length
     idle, noise = length, length + 1
     parity_at = 1 + frame.data_bits if frame.parity_bits else -1
