@@ -7,7 +7,7 @@ import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 
-from beacon_comm.cli.interrupts import uninterrupted
+from beacon_comm.cli.interrupts import interrupts_held, uninterrupted
 from beacon_comm.cli.progress import progress
 from beacon_comm.cli.publisher import PacedMessage, Playback, note, publish
 from beacon_comm.cli.replay import EVENT_TOPIC
@@ -151,8 +151,9 @@ def _deliver(
         try:
             writer.add_topic(topic, message_type)
             for message in progress(whole, str(options.write), total):
-                writer.write(topic, message.recorded_ns, message.cdr)
-                count += 1
+                with interrupts_held():  # or a message is counted in the bag's summary that is not in the bag
+                    writer.write(topic, message.recorded_ns, message.cdr)
+                    count += 1
         except (RecordingError, KeyboardInterrupt) as error:
             stopped = error  # what was written so far becomes a whole bag
         finally:
