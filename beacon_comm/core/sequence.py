@@ -33,7 +33,9 @@ from beacon_comm.core.sequence_detection import (
     FULL,
     KIND,
     KIND_NOISE,
+    KIND_OK,
     KIND_REPAIRED,
+    KIND_SEEN,
     KIND_UNREADABLE,
     LOST,
     MARGIN,
@@ -48,7 +50,7 @@ from beacon_comm.core.soft_decision import confidence_of, frame_layout
 from beacon_comm.core.trellis import framed_transitions
 
 ADJACENT_BITS = 15
-"""The character before a lock's first ok one is given out, too, if no more bits lie between their starts."""
+"""The character before the one from which on a lock is trusted is given out, too, if no more bits lie between their starts."""
 
 REFINED_AFTER = 25
 """Phase and histograms of a lock are learnt anew once over so many characters: a lock begins with a handful."""
@@ -77,8 +79,8 @@ class SequenceDemodulator:
         self._rows = np.zeros((_ROWS, FIRST_RATIO + self._frame.length))
         self._lock: Lock | None = None
         self._ended: Lock | None = None  # the lock at the stream's end
-        self._pending: Character | None = None  # said before the lock's first ok character
-        self._trusted = False  # the lock has said an ok character
+        self._pending: Character | None = None  # said before the lock is trusted
+        self._trusted = False  # the lock has seen a character that is ok, or nearly
         self._origin_ns: int | None = None
         self._t = np.empty(0, np.float64)
         self._polarity = np.empty(0, np.int8)
@@ -215,7 +217,7 @@ class SequenceDemodulator:
             character = self._character(row)
             if character is None:
                 continue
-            if self._trusted or character.status is Status.OK:
+            if self._trusted or row[KIND] in (KIND_OK, KIND_SEEN):
                 pending, self._pending = self._pending, None
                 if pending is not None and character.t_ns - pending.t_ns < ADJACENT_BITS * float(row[PERIOD_THEN]):
                     characters.append(pending)
@@ -232,7 +234,7 @@ class SequenceDemodulator:
             return None
         self._given_to = start + self._frame.length * period
         code, status = self._decode[word]
-        if kind == KIND_REPAIRED:
+        if kind in (KIND_SEEN, KIND_REPAIRED):
             status = Status.REPAIRED
         elif kind == KIND_NOISE and status is Status.OK:
             status = Status.FRAMING_ERROR

@@ -35,8 +35,12 @@ DELAY_FRAMES = 2
 OK_FRAME_MARGIN = 6.0
 """A frame margin (nat) from which on a word is ok although the free bits differ …"""
 
-OK_MARGIN = 4.0
-"""… or a bit of it is an erasure; and in any case it has to beat every other word and path by this (nat)."""
+OK_MARGIN = 12.0
+"""… or a bit of it is an erasure; and in any case it has to beat every other word and path by this (nat): the calibration
+of the confidence gives such a word 0.98."""
+
+SEEN_MARGIN = 4.0
+"""A word that is otherwise ok and beats the others by this (nat) is not ok, but shows that there is a beacon."""
 
 READABLE_MARGIN = 3.0
 """A word with an erased bit that beats the next one by less (nat) is not given out: it would be invented."""
@@ -97,7 +101,7 @@ BIT, LEARNT, NEXT_TABLES, NOISE_RUN, DOUBT, SILENT_RUN, ASLEEP = range(7)
 
 # What a row of words tells.
 WORD, KIND, BORDER_OF_START, MARGIN, PERIOD_THEN, FIRST_RATIO = range(6)
-KIND_OK, KIND_REPAIRED, KIND_NOISE, KIND_UNREADABLE = range(4)
+KIND_OK, KIND_SEEN, KIND_REPAIRED, KIND_NOISE, KIND_UNREADABLE = range(5)
 STILL_LOCKED, LOST, FULL = range(3)
 
 
@@ -385,7 +389,6 @@ def _decide_word(clock, state, layout, length, best, at, lag, row):  # type: ign
         return
     alike = fit >= state.levels[USUAL] - LEAST_FIT
     passes = alike and (frame_margin >= OK_FRAME_MARGIN or (word == free and not erased))
-    ok = passes and margin >= OK_MARGIN
     if passes:
         numbers[DOUBT] = max(0, numbers[DOUBT] - length)
     elif not erased:
@@ -396,7 +399,10 @@ def _decide_word(clock, state, layout, length, best, at, lag, row):  # type: ign
             state.levels[USUAL] += (fit - state.levels[USUAL]) / LEARNING_MEMORY
     clock.numbers[FROZEN] = 0 if passes else 1
     row[WORD], row[MARGIN], row[PERIOD_THEN] = word, margin, clock.values[PERIOD]
-    row[KIND] = KIND_OK if ok else KIND_UNREADABLE if erased and margin < READABLE_MARGIN else KIND_REPAIRED
+    if passes and margin >= SEEN_MARGIN:
+        row[KIND] = KIND_OK if margin >= OK_MARGIN else KIND_SEEN
+    else:
+        row[KIND] = KIND_UNREADABLE if erased and margin < READABLE_MARGIN else KIND_REPAIRED
     row[BORDER_OF_START] = state.borders[(at - length + 1) & _RING_MASK]
 
 
