@@ -7,11 +7,11 @@ from hypothesis import strategies as st
 from line_events import text_bits
 from sequence_lines import NS, beacon_events
 
-from beacon_comm.core.acquisition import Verdict, acquire
-from beacon_comm.core.bit_clock import BORDER, LATENCY_OFF, LATENCY_ON, P_PERIOD, PERIOD
+from beacon_comm.core.acquisition import Demands, Verdict, acquire
+from beacon_comm.core.bit_clock import BORDER, P_PERIOD, PERIOD
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.likelihood import CONTEXTS, COUNTS, LEVELS, compression_table
-from beacon_comm.core.rate_search import EDGE_SPREAD, periods_around
+from beacon_comm.core.rate_search import periods_around
 from beacon_comm.core.trellis import framed_transitions
 from beacon_comm.simulation.led import noise, square_wave
 
@@ -25,7 +25,7 @@ COMPRESSION = compression_table()
 def found(events, periods, needed=4, transitions=TRANSITIONS):
     t_ns, polarity = events
     t = (t_ns - t_ns[0]).astype(np.float64)
-    return acquire(t, polarity, np.asarray(periods), transitions, COMPRESSION, needed, 3, EDGE_SPREAD)
+    return acquire(t, polarity, np.asarray(periods), transitions, COMPRESSION, Demands(needed, 3))
 
 
 def beacon(text, bit_rate_bps, skipped=0, ends_after=5, frame=None, **options):
@@ -70,8 +70,8 @@ def test_latencies_are_those_of_the_edges():
     values = lock.clock.values
     borders = values[BORDER] % 1e6
     assert 0.0 <= borders < 1e6
-    for latency in (LATENCY_ON, LATENCY_OFF):
-        assert -0.3e6 <= values[latency] <= 0.7e6  # the edges of a bit lie in it, or a little before
+    # The edges of a bit lie in it, or a little before.
+    assert (lock.clock.latencies >= -0.3e6).all() and (lock.clock.latencies <= 0.7e6).all()
 
 
 @pytest.mark.parametrize('bit_rate_bps', RATES)
@@ -126,7 +126,7 @@ def test_characters_that_stand_alone_are_found(gap_bits):
     lock = found(beacon_events(text_bits(TEXT[:12], gap_bits=gap_bits), 1000.0, lead_s=0.01, tail_s=0.01), [1e6])
     assert lock.verdict.passing == 12
     assert lock.verdict.idle > 12 * (gap_bits - 2)
-    assert lock.verdict.full == (gap_bits < 5)
+    assert lock.verdict.full  # sharp edges leave no room for another rate
 
 
 def test_what_was_learnt_tells_ones_from_zeros():
@@ -142,7 +142,7 @@ def test_what_was_learnt_tells_ones_from_zeros():
 def test_the_window_is_left_as_it_was():
     t_ns, polarity = beacon(TEXT[:12], 1000.0)
     t, kept = t_ns.astype(np.float64), polarity.copy()
-    acquire(t, polarity, np.array([1e6]), TRANSITIONS, COMPRESSION, 4, 3)
+    acquire(t, polarity, np.array([1e6]), TRANSITIONS, COMPRESSION, Demands(4))
     assert np.array_equal(t, t_ns) and np.array_equal(polarity, kept)
 
 
@@ -192,14 +192,14 @@ def test_a_signal_read_at_twice_its_rate_is_refused(codes, skipped):
 
 def test_nothing_and_next_to_nothing_is_refused():
     empty = (np.empty(0), np.empty(0, np.int8))
-    assert acquire(*empty, np.array([1e6]), TRANSITIONS, COMPRESSION, 4, 3) is None
-    assert acquire(np.zeros(3), np.ones(3, np.int8), np.array([1e6]), TRANSITIONS, COMPRESSION, 4, 3) is None
+    assert acquire(*empty, np.array([1e6]), TRANSITIONS, COMPRESSION, Demands(4)) is None
+    assert acquire(np.zeros(3), np.ones(3, np.int8), np.array([1e6]), TRANSITIONS, COMPRESSION, Demands(4)) is None
     for count in (16, 1000):
         burst = np.zeros(count), np.ones(count, np.int8)  # all at one time
-        assert acquire(*burst, np.array([1e6]), TRANSITIONS, COMPRESSION, 4, 3) is None
+        assert acquire(*burst, np.array([1e6]), TRANSITIONS, COMPRESSION, Demands(4)) is None
     held = np.arange(0.0, 300e6, 1e4)
     for level in (1, -1):
-        assert acquire(held, np.full(len(held), level, np.int8), np.array([1e6]), TRANSITIONS, COMPRESSION, 4, 3) is None
+        assert acquire(held, np.full(len(held), level, np.int8), np.array([1e6]), TRANSITIONS, COMPRESSION, Demands(4)) is None
 
 
 def test_fewer_words_than_needed_are_refused():
@@ -231,6 +231,7 @@ def test_verdict():
     for refused in ({'failing': 5.0}, {'place_margin': 1.0}, {'oversampled': 0.95}, {'passing': 0, 'failing': 3.0}):
         assert not verdict(**refused).convinces
     assert verdict(passing=40, failing=20.0).convinces  # a weak signal, but a long one
-    for not_full in ({'covered': 50}, {'passing': 5}, {'changes': 1.5}):
+    assert verdict(covered=50, spread=0.05).full  # sharp edges, with pauses between the characters
+    for not_full in ({'covered': 50, 'spread': 0.15}, {'covered': 50, 'failing': 4.0}, {'passing': 3}, {'changes': 1.5}):
         assert not verdict(**not_full).full
     assert verdict(passing=0, covered=0).merit == 0.0

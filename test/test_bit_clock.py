@@ -8,15 +8,17 @@ from line_events import line_events
 
 from beacon_comm.core.bit_clock import (
     BORDER,
-    FROZEN,
-    LATENCY_OFF,
-    LATENCY_ON,
+    EDGE_LAG,
+    OFF,
+    ON,
     P_PERIOD,
     P_PHASE,
     PERIOD,
     PULL,
+    UNSURE_PHASE,
     go_on,
     make_clock,
+    see_edge,
     take_events,
 )
 from beacon_comm.core.likelihood import COUNTS, SUB_SLOTS
@@ -25,19 +27,30 @@ RATE_BPS = 1000.0
 BIT = 1e6
 
 
-def clock_at(border=0.0, period=BIT, latency=(0.0, 0.0), spread=0.05, period_error=0.003):
-    return make_clock(border, period, latency, spread, period_error)
+def clock_at(border=0.0, period=BIT, latencies=(0.0, 0.0), spread=0.05, period_error=0.003):
+    return make_clock(border, period, np.array(latencies), spread, period_error)
 
 
-def run(clock, t, polarity, bits, sign=1, first=0):
-    """Take so many bits; return the counts of each, ``(bits, COUNTS)``, their borders, and the next event's index."""
+def run(clock, t, polarity, bits, sign=1, first=0, line=None, since=0):
+    """Take so many bits; return the counts of each, ``(bits, COUNTS)``, their borders, and the next event's index.
+
+    ``line`` are the bits that were sent, as a receiver decides them; the first one to be taken is number ``since``.
+    """
     counts, borders = [], []
-    for _ in range(bits):
+    for n in range(since, since + bits):
         borders.append(clock.values[BORDER])
-        first = take_events(clock.values, clock.numbers, clock.counts, t, polarity, first, sign)
+        first = take_events(clock, t, polarity, first, sign)
         counts.append(clock.counts.copy())
-        go_on(clock.values, clock.counts, 1)
+        follow(clock, line, n)
+        go_on(clock, 1)
     return np.array(counts), np.array(borders), first
+
+
+def follow(clock, line, n):
+    """Let the clock see the edge that is known at the end of the bit ``n``, if there is one."""
+    here = n - EDGE_LAG
+    if line is not None and 0 < here < len(line) and line[here] != line[here - 1]:
+        see_edge(clock, ON if line[here] else OFF)
 
 
 def random_line(bits, seed=0):
@@ -87,22 +100,25 @@ def test_every_event_is_counted_once(seed, count, begin):
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.lists(st.integers(0, 2000), max_size=30), st.sampled_from([1, -1]))
 def test_any_batching_gives_the_same_counts_and_the_same_clock(seed, cuts, sign):
-    t, polarity = events_of(random_line(100, seed), RATE_BPS * 1.001, burst=15, width_bits=0.6)
+    line = random_line(100, seed)
+    t, polarity = events_of(line, RATE_BPS * 1.001, burst=15, width_bits=0.6)
+    line = line if sign > 0 else 1 - line
     whole, parted = clock_at(), clock_at()
-    expected, _, _ = run(whole, t, polarity, 120, sign)
+    expected, _, _ = run(whole, t, polarity, 120, sign, line=line)
     edges = [0, *sorted(min(cut, len(t)) for cut in cuts), len(t)]
     counts = []
     for start, stop in zip(edges[:-1], edges[1:], strict=True):
         first, batch = 0, (t[start:stop], polarity[start:stop])
         while True:
-            first = take_events(parted.values, parted.numbers, parted.counts, *batch, first, sign)
+            first = take_events(parted, *batch, first, sign)
             if first == stop - start:
                 break
+            follow(parted, line, len(counts))
             counts.append(parted.counts.copy())
-            go_on(parted.values, parted.counts, 1)
-    rest, _, _ = run(parted, t, polarity, 120 - len(counts), sign, first=len(t))
+            go_on(parted, 1)
+    rest, _, _ = run(parted, t, polarity, 120 - len(counts), sign, first=len(t), line=line, since=len(counts))
     assert np.array_equal(np.concatenate([np.reshape(counts, (-1, COUNTS)), rest]), expected)
-    assert np.array_equal(parted.values, whole.values) and np.array_equal(parted.numbers, whole.numbers)
+    assert all(np.array_equal(one, other) for one, other in zip(parted, whole, strict=True))
 
 
 # --- following ----------------------------------------------------------------------------------------------------
@@ -110,18 +126,20 @@ def test_any_batching_gives_the_same_counts_and_the_same_clock(seed, cuts, sign)
 
 @pytest.mark.parametrize('late', [-0.2, -0.1, 0.1, 0.2])
 def test_a_clock_that_began_beside_the_borders_comes_back(late):
-    t, polarity = events_of(random_line(300))
+    line = random_line(300)
+    t, polarity = events_of(line)
     clock = clock_at(border=late * BIT)
-    run(clock, t, polarity, 300)
+    run(clock, t, polarity, 300, line=line)
     assert abs(off(clock)) < 0.02
     assert clock.values[PERIOD] == pytest.approx(BIT, rel=2e-4)
 
 
 @pytest.mark.parametrize('wrong', [-0.003, -0.001, 0.0, 0.001, 0.003])
 def test_a_period_that_was_a_little_wrong_is_put_right(wrong):
-    t, polarity = events_of(random_line(400), RATE_BPS * (1.0 + wrong))
+    line = random_line(400)
+    t, polarity = events_of(line, RATE_BPS * (1.0 + wrong))
     clock = clock_at()
-    run(clock, t, polarity, 400)
+    run(clock, t, polarity, 400, line=line)
     assert clock.values[PERIOD] == pytest.approx(BIT / (1.0 + wrong), rel=1e-4)
     assert abs(off(clock, RATE_BPS * (1.0 + wrong))) < 0.02
 
@@ -136,16 +154,17 @@ def test_a_clock_that_drifts_away_is_followed(by):
     t = (borders[changes][:, None] + np.arange(10) * 5e3).ravel()
     polarity = np.repeat(np.where(bits[changes] == 1, 1, -1), 10).astype(np.int8)
     clock = clock_at()
-    _, found, _ = run(clock, t, polarity, 2450)
+    _, found, _ = run(clock, t, polarity, 2450, line=bits)
     assert np.abs(found - borders[:2450]).max() < 0.1 * BIT
     assert clock.values[PERIOD] == pytest.approx(BIT / (1.0 + by), rel=5e-4)
 
 
 def test_the_period_does_not_leave_its_bounds():
-    t, polarity = events_of(np.arange(3000) % 2, RATE_BPS * 1.2)
+    line = np.arange(3000) % 2
+    t, polarity = events_of(line, RATE_BPS * 1.2)
     clock = clock_at()
-    for _ in range(3000):
-        run(clock, t, polarity, 1, first=int(np.searchsorted(t, clock.values[BORDER])))
+    for n in range(3000):
+        run(clock, t, polarity, 1, first=int(np.searchsorted(t, clock.values[BORDER])), line=line, since=n)
         assert BIT * (1.0 - PULL) <= clock.values[PERIOD] <= BIT * (1.0 + PULL)
 
 
@@ -154,50 +173,78 @@ def test_each_polarity_has_its_own_latency():
     t, polarity = events_of(bits, burst=10, width_bits=0.01)
     t = t + np.where(polarity > 0, 0.20, 0.10) * BIT
     order = np.argsort(t, kind='stable')
-    clock = clock_at(latency=(0.15 * BIT, 0.15 * BIT))
-    run(clock, t[order], polarity[order], 2000)
-    assert clock.values[LATENCY_ON] - clock.values[LATENCY_OFF] == pytest.approx(0.1 * BIT, abs=0.01 * BIT)
-    assert clock.values[LATENCY_ON] + clock.values[LATENCY_OFF] == pytest.approx(0.3 * BIT)  # their mean is the phase
+    clock = clock_at(latencies=(0.15 * BIT, 0.15 * BIT))
+    run(clock, t[order], polarity[order], 2000, line=bits)
+    assert clock.latencies[ON] - clock.latencies[OFF] == pytest.approx(0.1 * BIT, abs=0.01 * BIT)
+    assert clock.latencies.sum() == pytest.approx(0.3 * BIT)  # their mean is the phase
     assert abs(off(clock)) < 0.02
 
 
 def test_frozen_it_only_predicts():
-    t, polarity = events_of(random_line(200), RATE_BPS * 1.003, t0_ns=100_000)
+    line = random_line(200)
+    t, polarity = events_of(line, RATE_BPS * 1.003, t0_ns=100_000)
     clock = clock_at()
-    clock.numbers[FROZEN] = 1
-    counts, borders, first = run(clock, t, polarity, 220)
+    clock.frozen[0] = True
+    counts, borders, first = run(clock, t, polarity, 220, line=line)
     assert np.array_equal(borders, BIT * np.arange(220))
-    assert clock.values[PERIOD] == BIT and clock.values[LATENCY_ON] == clock.values[LATENCY_OFF] == 0.0
+    assert clock.values[PERIOD] == BIT and (clock.latencies == 0.0).all()
     assert counts.sum() == first == len(t)  # it counts all the same
 
 
-def test_three_events_are_no_edge_and_the_first_of_four_is():
-    for run_length, moves in ((3, False), (4, True)):
+def test_three_events_are_no_edge_and_four_are():
+    for count, moves in ((3, False), (4, True)):
         clock = clock_at()
-        t = np.concatenate([np.arange(4) * 0.01, 2.1 + np.arange(run_length) * 0.1]) * BIT
-        polarity = np.repeat([1, -1], [4, run_length]).astype(np.int8)
-        run(clock, t, polarity, 4)
-        assert (clock.values[BORDER] != 4 * BIT) == moves
-    assert 0.0 < clock.values[BORDER] - 4 * BIT < 0.1 * BIT + 1.0
+        t = np.concatenate([np.arange(4) * 0.01, 2.1 + np.arange(count) * 0.1]) * BIT
+        polarity = np.repeat([1, -1], [4, count]).astype(np.int8)
+        run(clock, t, polarity, 5, line=[1, 1, 0, 0, 0])
+        assert (clock.values[BORDER] != 5 * BIT) == moves
+    assert 0.0 < clock.values[BORDER] - 5 * BIT < 0.1 * BIT + 1.0
 
 
-def test_edges_far_from_the_borders_are_not_its_own():
+def test_wrongly_decided_bits_do_not_move_it_far():
+    line = random_line(400)
+    t, polarity = events_of(line)
+    decided = line ^ (np.random.default_rng(3).random(400) < 0.05)
     clock = clock_at()
-    t, polarity = events_of(np.arange(40) % 2, t0_ns=round(0.45 * BIT))
-    run(clock, t, polarity, 40)
-    assert clock.values[BORDER] == 40 * BIT
+    _, borders, _ = run(clock, t, polarity, 400, line=decided)
+    assert np.abs(borders - np.arange(400) * BIT).max() < 0.05 * BIT
+
+
+@pytest.mark.parametrize('ratio', [1.0, 2.0])
+def test_background_does_not_move_it(ratio):
+    random, line = np.random.default_rng(1), random_line(600)
+    t, polarity = events_of(line, burst=20, width_bits=0.3)
+    count = round(ratio * len(t))
+    t = np.concatenate([t, random.random(count) * 600 * BIT])
+    polarity = np.concatenate([polarity, random.choice(np.array([-1, 1], np.int8), count)])
+    order = np.argsort(t, kind='stable')
+    clock = clock_at(spread=0.1)
+    _, borders, _ = run(clock, t[order], polarity[order], 600, line=line)
+    assert np.abs(borders - np.arange(600) * BIT)[100:].max() < 0.1 * BIT
+
+
+@pytest.mark.parametrize('late', [-0.3, -0.1, 0.1, 0.3])
+def test_after_a_long_idle_line_a_fall_sets_the_phase_at_once(late):
+    line = np.array([1, 1, 1, 0, 1, 0, 0, 1])
+    t, polarity = events_of(line, burst=10, width_bits=0.01)
+    clock = clock_at(border=late * BIT)
+    clock.values[P_PHASE] = (3.0 * UNSURE_PHASE) ** 2
+    run(clock, t, polarity, 4)  # the fall is in the third or the fourth
+    assert abs(off(clock)) < 0.02
+    assert clock.values[P_PHASE] < UNSURE_PHASE**2
 
 
 # --- uncertainty --------------------------------------------------------------------------------------------------
 
 
 def test_uncertainty_falls_with_edges_and_grows_without():
-    t, polarity = events_of(random_line(200))
+    line = random_line(200)
+    t, polarity = events_of(line)
     clock = clock_at()
     known = [clock.values[[P_PHASE, P_PERIOD]].copy()]
     first = 0
-    for _ in range(2):
-        _, _, first = run(clock, t, polarity, 100, first=first)
+    for since in (0, 100):
+        _, _, first = run(clock, t, polarity, 100, first=first, line=line, since=since)
         known.append(clock.values[[P_PHASE, P_PERIOD]].copy())
     assert (known[1] < known[0]).all() and known[2][1] < known[1][1]
     for _ in range(2):
@@ -205,7 +252,7 @@ def test_uncertainty_falls_with_edges_and_grows_without():
         known.append(clock.values[[P_PHASE, P_PERIOD]].copy())
     assert (known[3] > known[2]).all() and (known[4] > known[3]).all()
     # However long the silence is, phase and period are not unknown altogether, and the matrix stays one.
-    go_on(clock.values, clock.counts, 10_000_000)
+    go_on(clock, 10_000_000)
     assert np.isfinite(clock.values).all()
     assert 0.0 < clock.values[P_PHASE] <= 0.3**2 + 1e-12 and 0.0 < clock.values[P_PERIOD] <= 0.003**2 + 1e-12
     assert clock.values[BORDER] == pytest.approx((600 + 10_000_000) * BIT, rel=1e-3)
@@ -221,7 +268,7 @@ def test_the_estimate_of_the_period_is_as_good_as_it_says():
         t = (at[:, None] + np.arange(4) * 1.0).ravel()
         polarity = np.repeat(np.where(bits[edges] == 1, 1, -1), 4).astype(np.int8)
         clock = clock_at(period=BIT * (1.0 + random.normal(0.0, 1e-3)), period_error=1e-3)
-        run(clock, t, polarity, 300)
+        run(clock, t, polarity, 300, line=bits)
         wrongs.append(clock.values[PERIOD] / BIT - 1.0)
         deviations.append(clock.values[P_PERIOD] ** 0.5)
     # Edges jitter by 0.05 bit; the clock also allows for a drift that is not there.

@@ -5,8 +5,8 @@ import pytest
 from line_events import text_bits
 from sequence_lines import NS, beacon_events
 
-from beacon_comm.core.acquisition import acquire
-from beacon_comm.core.bit_clock import BORDER, FROZEN, PERIOD
+from beacon_comm.core.acquisition import Demands, acquire
+from beacon_comm.core.bit_clock import BORDER, PERIOD
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.likelihood import compression_table
 from beacon_comm.core.sequence_detection import (
@@ -43,7 +43,7 @@ class Locked:
 
     def __init__(self, t, polarity, learnt_from=20, rows=512):
         window = slice(0, int(np.searchsorted(t, t[0] + (learnt_from * 11 + 5) * BIT)))
-        lock = acquire(t[window], polarity[window], np.array([BIT]), TRANSITIONS, compression_table(), 4, 3)
+        lock = acquire(t[window], polarity[window], np.array([BIT]), TRANSITIONS, compression_table(), Demands(4))
         assert lock is not None
         self.clock, self.state, self.inverted = lock.clock, lock.detection, lock.inverted
         start_at(self.state, int(lock.positions[0]), 11)
@@ -143,7 +143,7 @@ def test_noise_freezes_the_clock_and_loses_the_lock():
     garbage, sign = noise(60_000.0, 2.0, t0_ns=round(t[-1]), seed=1)
     rows, status = locked.push(garbage.astype(np.float64), sign, float(garbage[-1]))
     assert status == LOST
-    assert locked.clock.numbers[FROZEN] == 1
+    assert locked.clock.frozen[0]
     assert locked.clock.values[PERIOD] == pytest.approx(BIT, rel=5e-3)
     assert locked.clock.values[BORDER] < t[-1] + 60 * 11 * BIT
     new = rows[rows[:, BORDER_OF_START] > t[-1]]

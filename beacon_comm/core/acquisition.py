@@ -22,7 +22,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from beacon_comm.core.bit_clock import EDGE_RUN, BitClock, make_clock
+from beacon_comm.core.bit_clock import EDGE_RUN, OFF, ON, BitClock, make_clock
 from beacon_comm.core.likelihood import CONTEXTS, COUNTS, LEVELS, SUB_SLOTS, learn, logarithms, weigh
 from beacon_comm.core.sequence_detection import SILENT_SHARE, Detection, make_detection
 from beacon_comm.core.trellis import Transitions, framed_path, free_bits, place_margin
@@ -49,7 +49,7 @@ CLEAR_FAILING, CLEAR_MARGIN = 0.15, 18.0
 LONG_WORDS, LONG_FAILING, LONG_MARGIN = 12, 0.5, 35.0
 """… or with so many passing words, where more of them may fail (a weak signal), but none other is nearly as likely."""
 
-FULL_WORDS, FULL_SHARE = 8, 0.6
+FULL_WORDS, FULL_SHARE = 4, 0.6
 """So many words that pass over so much of a window leave no room for another rate."""
 
 PLACE_MARGIN = 6.0
@@ -60,6 +60,33 @@ OVERSAMPLED_SHARE = 0.9
 
 LEAST_CHANGES = 3.0
 """Words with fewer changes of level than this, in the mean, may be one character of a slower signal."""
+
+
+FEW_CHANGES = 2.0
+"""One change of level within a word is what a glitch looks like, and a character of a faster signal between pauses."""
+
+EDGE_SPREAD, SHARP_SPREAD = 0.22, 0.1
+"""Edges spread farther about the bit grid (bit) are those of another rate: the recordings' have 0.07 to 0.16.  Edges no
+farther from it than the second leave no room for another rate."""
+
+NEIGHBOURS = 2
+"""Periods so near to one that was read are not read: its edges would have led there."""
+
+LEAST_PERIOD_STD = 1e-5
+"""No window says more about a period (share)."""
+
+LEAST_EDGES = 6
+"""Fewer edges say nothing about the grid."""
+
+NO_EDGES_SPREAD = 0.3
+"""Where there are too few edges they count as evenly spread (bit)."""
+
+EDGE_LEAD = 0.3
+"""An edge is looked for from so much of a bit before its border on, over one bit."""
+
+SLOPE_DEVIATIONS, LEAST_SLOPE = 3.0, 0.004
+"""Edges that within the words go off the grid by so many standard deviations, and by more than this (bit a bit), are those
+of another rate, whose characters happen to begin on this grid, too: pauses go so well with it."""
 
 
 class Verdict(NamedTuple):
@@ -76,6 +103,8 @@ class Verdict(NamedTuple):
         place_margin: see :func:`beacon_comm.core.trellis.place_margin`, of a bit in the middle of the window (nat).
         oversampled: the greatest share of the changes of level that lie on every second or every third bit.
         spread: of the edges about the bit grid, standard deviation (bit).
+        slope: by how much the edges within words go off the grid from bit to bit (bit), 0 if that may be chance.
+        period_std: standard deviation of the period (share).
     """
 
     passing: int
@@ -88,6 +117,8 @@ class Verdict(NamedTuple):
     place_margin: float
     oversampled: float
     spread: float
+    slope: float = 0.0
+    period_std: float = 0.0
 
     @property
     def share(self) -> float:
@@ -98,6 +129,11 @@ class Verdict(NamedTuple):
     def merit(self) -> float:
         """Share of the window that speaks for the lock, less what speaks against it."""
         return (self.covered - self.failing * self.covered / max(self.passing, 1)) / self.bits
+
+    @property
+    def fit(self) -> float:
+        """Mean log likelihood of a bit (nat): the right period of several has the greatest."""
+        return self.likelihood / self.bits
 
     @property
     def convinces(self) -> bool:
@@ -113,7 +149,40 @@ class Verdict(NamedTuple):
     @property
     def full(self) -> bool:
         """Whether the words leave no room for another rate."""
-        return self.passing >= FULL_WORDS and self.share >= FULL_SHARE and self.changes >= LEAST_CHANGES
+        sharp = self.spread <= SHARP_SPREAD and self.failing <= CLEAR_FAILING * self.passing
+        many = self.passing >= FULL_WORDS and self.changes >= LEAST_CHANGES
+        return many and (self.share >= FULL_SHARE or sharp)
+
+
+class Demands(NamedTuple):
+    """What a lock has to show.
+
+    Attributes:
+        needed: words that have to pass.
+        tried: so many of the periods are read, those with the widest eye.
+        most_spread: standard deviation of the edges about the bit grid (bit); evenly spread ones, of another rate, have 0.29.
+        least_changes: of level within passing words, mean.
+        most_stray: share by which the period may leave those that were asked for.
+        most_period_std: standard deviation of the period (share): the clock must not lose the grid before the edges that
+            follow have corrected it.
+    """
+
+    needed: int
+    tried: int = 4
+    most_spread: float = EDGE_SPREAD
+    least_changes: float = 0.0
+    most_stray: float = 0.005
+    most_period_std: float = 0.0017
+
+    def met(self, verdict: Verdict) -> bool:
+        """Whether a window's verdict is enough."""
+        return (
+            verdict.passing >= self.needed
+            and verdict.convinces
+            and verdict.spread <= self.most_spread
+            and verdict.changes >= self.least_changes
+            and verdict.period_std <= self.most_period_std
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,10 +212,7 @@ def acquire(
     periods: NDArray[np.float64],
     transitions: Transitions,
     compression: NDArray[np.uint8],
-    needed: int,
-    tried: int,
-    most_spread: float = 1.0,
-    trusted_share: float = 2.0,
+    demands: Demands,
 ) -> Lock | None:
     """Look for a beacon in a window of events.
 
@@ -156,32 +222,30 @@ def acquire(
         periods: periods (ns) to look at, ``(k,)``; the spacing finer than a quarter bit over the window.
         transitions: framed trellis.
         compression: table of compressed counts.
-        needed: words that have to pass.
-        tried: so many of the periods are read, those with the widest eye.
-        most_spread: standard deviation of the edges about the bit grid (bit) up to which a lock is believed; evenly
-            spread edges, of another rate, have 0.29.
-        trusted_share: share of the window covered by passing words, no fewer than 8, from which on the edges do not matter:
-            background events hide them.
+        demands: what a lock has to show.
     """
-    if len(t) < EDGE_RUN * needed:
+    if len(t) < EDGE_RUN * demands.needed:
         return None
     start, stop = t[0], t[-1]
+    nearest, farthest = (1.0 - demands.most_stray) * periods.min(), (1.0 + demands.most_stray) * periods.max()
     eyes = _eyes(t, polarity, start, periods, stop)
     found: Lock | None = None
-    for k in np.argsort(-eyes, kind='stable')[:tried]:
-        lock = _read(t, polarity, start, stop, float(periods[k]), transitions, compression, needed)
-        if lock is None or lock.verdict.passing < needed or not lock.verdict.convinces:
+    for _ in range(demands.tried):
+        k = int(np.argmax(eyes))
+        if eyes[k] < 0.0:
+            break
+        eyes[max(k - NEIGHBOURS, 0) : k + NEIGHBOURS + 1] = -1.0
+        lock = _read(t, polarity, start, stop, float(periods[k]), transitions, compression, demands.needed)
+        if lock is not None and abs(lock.verdict.slope) > LEAST_SLOPE:
+            period = lock.period * (1.0 + lock.verdict.slope)
+            other = _read(t, polarity, start, stop, period, transitions, compression, demands.needed)
+            if other is not None and other.verdict.spread < lock.verdict.spread:
+                lock = other
+        if lock is None or not nearest <= lock.period <= farthest:
             continue
-        trusted = lock.verdict.share >= trusted_share and lock.verdict.passing >= FULL_WORDS
-        if lock.verdict.spread > most_spread and not trusted:
-            continue
-        if found is None or _merit(lock.verdict) > _merit(found.verdict):
+        if found is None or lock.verdict.fit > found.verdict.fit:
             found = lock
-    return found
-
-
-def _merit(verdict: Verdict) -> tuple[float, float]:
-    return verdict.passing - 2.0 * verdict.failing, verdict.likelihood / verdict.bits
+    return found if found is not None and demands.met(found.verdict) else None
 
 
 def _read(
@@ -194,10 +258,8 @@ def _read(
     compression: NDArray[np.uint8],
     needed: int,
 ) -> Lock | None:
-    fit = np.zeros(5)
     for _ in range(2):
-        _fit_edges(t, polarity, start, period, fit)
-        period *= 1.0 + fit[0]
+        period *= 1.0 + _stretch(t, polarity, start, period)
     border = start + (_phase(_eye(_fine(t, polarity, start, period, stop))) - 1.0) * period
     bits = int((stop - border) / period) + 1
     raw = _counts(t, polarity, border, period, bits)
@@ -217,21 +279,31 @@ def _read(
     framed = np.flatnonzero(path // (2 * CONTEXTS) < transitions.length)
     middle = int(framed[len(framed) // 2]) if len(framed) else 0
     margin = place_margin(transitions, likelihoods, middle)
+    latencies = np.empty(2)
+    edges = _locate_edges(t, polarity, border, period, path, transitions.length, inverted, latencies)
     verdict = Verdict(
-        passing, failing, idle, covered, changes / max(passing, 1), bits, likelihood, margin, _oversampled(free), float(fit[3])
+        passing,
+        failing,
+        idle,
+        covered,
+        changes / max(passing, 1),
+        bits,
+        likelihood,
+        margin,
+        _oversampled(free),
+        edges.spread,
+        edges.slope,
+        max(edges.stretch_std, LEAST_PERIOD_STD),
     )
     if inverted:
         histograms = np.concatenate((histograms[::-1, SUB_SLOTS:], histograms[::-1, :SUB_SLOTS]), axis=1)
     means = _means(raw / gain, path)
     silence = float(np.mean(raw.sum(axis=1)[framed] < SILENT_SHARE * gain * means.mean())) if len(framed) else 1.0
-    # Latencies of the edges behind the borders, of which the fold knows only the fraction of a bit.
-    latency = [((fit[k] - (border - start) / period + 0.3) % 1.0 - 0.3) * period for k in (1, 2)]
-    if inverted:
-        latency.reverse()
-    clock = make_clock(border, period, (latency[0], latency[1]), fit[3], max(fit[4], 1e-5))
-    usual = likelihood / bits
+    border -= edges.stretch * edges.middle * period
+    period *= 1.0 + edges.stretch
+    clock = make_clock(border, period, latencies * period, edges.spread, verdict.period_std)
     detection = make_detection(
-        histograms, means, gain, silence, usual, verdict.passing, compression, transitions.states
+        histograms, means, gain, silence, verdict.fit, _empty_share(raw, path), verdict.passing, compression, transitions.states
     )
     return Lock(clock, detection, inverted, verdict, period, path // (2 * CONTEXTS))
 
@@ -281,11 +353,10 @@ def _phase(eye):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _fit_edges(t, polarity, start, period, fit):  # type: ignore[no-untyped-def]
-    """Fit the edges of a window to the bit grid.
+def _stretch(t, polarity, start, period):  # type: ignore[no-untyped-def]
+    """Return by how much (share) a period is too short, from where the edges of a window lie in the bits.
 
-    Writes to ``fit``: correction of the period (share), mean fraction of a bit of the ON and of the OFF edges, standard
-    deviation of the residuals (bit), standard deviation of the corrected period (share).
+    There are no bits yet to say where edges are: an edge is the first of ``EDGE_RUN`` events of the opposite polarity.
     """
     edges, rising = np.empty(len(t) // EDGE_RUN + 1), np.empty(len(t) // EDGE_RUN + 1, np.bool_)
     count, run, run_polarity, level, since = 0, 0, 0, 0, 0.0
@@ -298,30 +369,98 @@ def _fit_edges(t, polarity, start, period, fit):  # type: ignore[no-untyped-def]
                 edges[count], rising[count] = (since - start) / period, run_polarity > 0
                 count += 1
             level = run_polarity
-    fit[:] = 0.0
-    fit[3], fit[4] = 0.3, 0.01
-    if count < 6:
-        return
+    if count < LEAST_EDGES:
+        return 0.0
+    edges, rising = edges[:count], rising[:count]
+    from_middle, off = edges - edges.mean(), np.empty(count)
     for kind in range(2):
         c, s = 0.0, 0.0
         for i in range(count):
             if rising[i] == (kind == 0):
                 c += np.cos(2.0 * np.pi * edges[i])
                 s += np.sin(2.0 * np.pi * edges[i])
-        fit[1 + kind] = np.arctan2(s, c) / (2.0 * np.pi)
-    mean_x = edges[:count].mean()
-    xy, xx, squares = 0.0, 0.0, 0.0
-    for i in range(count):
-        off = edges[i] - fit[1 if rising[i] else 2]
-        residual = off - np.floor(off + 0.5)
-        xy += (edges[i] - mean_x) * residual
-        xx += (edges[i] - mean_x) ** 2
-        squares += residual * residual
-    slope = xy / xx if xx > 0.0 else 0.0
-    spread = np.sqrt(max(squares / count, 1e-6))
-    fit[0] = slope
-    fit[3] = spread
-    fit[4] = spread / np.sqrt(xx) if xx > 0.0 else 0.01
+        late = np.arctan2(s, c) / (2.0 * np.pi)
+        for i in range(count):
+            if rising[i] == (kind == 0):
+                off[i] = edges[i] - late - np.floor(edges[i] - late + 0.5)
+    xx = (from_middle * from_middle).sum()
+    return (from_middle * off).sum() / xx if xx > 0.0 else 0.0
+
+
+class Edges(NamedTuple):
+    """What the edges of a window say.
+
+    Attributes:
+        spread, slope: see :class:`Verdict`.
+        stretch, stretch_std: by how much the period is too short (share), and its standard deviation.
+        middle: of the edges (bits from the first border).
+    """
+
+    spread: float
+    slope: float
+    stretch: float
+    stretch_std: float
+    middle: float
+
+
+@njit(cache=True, nogil=True)
+def _locate_edges(t, polarity, border, period, path, length, inverted, latencies):  # type: ignore[no-untyped-def]
+    """Locate the edges where the words of a path have them; return what they say, and write their latencies (bit).
+
+    They are looked for as the bit clock does, see :mod:`beacon_comm.core.bit_clock`, in one bit about the border.
+    """
+    at, places = np.empty(len(path)), np.empty(len(path))
+    words, in_word, kinds = np.empty(len(path), np.int64), np.empty(len(path), np.int64), np.empty(len(path), np.int64)
+    count, word, first = 0, 0, 0
+    sign = -1 if inverted else 1
+    for n in range(1, len(path)):
+        place = path[n] // (2 * CONTEXTS)
+        word += place == 0
+        if place >= length or (path[n] & 1) == (path[n - 1] & 1):
+            continue
+        begin = border + (n - EDGE_LEAD) * period
+        up = sign if path[n] & 1 else -sign
+        while first < len(t) and t[first] < begin:
+            first += 1
+        total, least, rise, last = 0, 0, 0, first
+        while last < len(t) and t[last] < begin + period:
+            total += up * polarity[last]
+            least = min(least, total)
+            rise = max(rise, total - least)
+            last += 1
+        if rise == 0:
+            continue
+        total, lowest, edge = 0, np.inf, first
+        for i in range(first, last):
+            level = total - rise * (t[i] - begin) / period
+            if level <= lowest:
+                lowest, edge = level, i
+            total += up * polarity[i]
+        at[count], places[count] = n, (t[edge] - border) / period - n
+        words[count], in_word[count], kinds[count] = word, place, ON if path[n] & 1 else OFF
+        count += 1
+    latencies[:] = 0.0
+    if count < LEAST_EDGES:
+        return Edges(NO_EDGES_SPREAD, 0.0, 0.0, 0.01, 0.0)
+    at, places, words, in_word, kinds = at[:count], places[:count], words[:count], in_word[:count], kinds[:count]
+    for kind in (OFF, ON):
+        of_kind = kinds == kind
+        if of_kind.any():
+            latencies[kind] = places[of_kind].mean()
+        places -= np.where(of_kind, latencies[kind], 0.0)
+    xx, xy, start = 0.0, 0.0, 0
+    for end in range(1, count + 1):
+        if end == count or words[end] != words[start]:
+            inside = in_word[start:end] - in_word[start:end].mean()
+            xx += (inside * inside).sum()
+            xy += (inside * places[start:end]).sum()
+            start = end
+    slope = xy / xx if abs(xy) > SLOPE_DEVIATIONS * places.std() * np.sqrt(xx) else 0.0
+    from_middle = at - at.mean()
+    xx = (from_middle * from_middle).sum()
+    stretch = (from_middle * places).sum() / xx
+    places -= stretch * from_middle
+    return Edges(places.std(), slope, stretch, places.std() / np.sqrt(xx), at.mean())
 
 
 @njit(cache=True, nogil=True)
@@ -420,6 +559,18 @@ def _judge(path, free, length):  # type: ignore[no-untyped-def]
             else:
                 failing += 1
     return passing, failing + noise / length, idle, changes
+
+
+@njit(cache=True, nogil=True)
+def _empty_share(raw, path):  # type: ignore[no-untyped-def]
+    """Return the share of held bits without any event; with none seen, one half."""
+    held, empty = 1.0, 0.5
+    for n in range(len(path)):
+        context = path[n] & (CONTEXTS - 1)
+        if context == 0 or context == CONTEXTS - 1:
+            held += 1.0
+            empty += raw[n].sum() == 0
+    return empty / held
 
 
 def _oversampled(bits: NDArray[np.uint8]) -> float:

@@ -1,13 +1,16 @@
 """The bit clock: where bits begin, followed on the edges, and the events of each bit counted in its sub-slots.
 
-An *edge* is the first of 4 consecutive events of the opposite polarity; each polarity has its own mean latency behind
-the border of the bit.  What an edge lies off the nearest border is the measurement of a Kalman filter with two states,
-the phase and the period of the clock::
+Where the decided bits change, an *edge* is located: the events after it are of one polarity, those before of the other or
+of both, so that the sum of the signed events, less half of what a burst adds in the time, is least (to OFF: greatest) at
+the edge.  Background events, as many of either polarity, hardly move that.
 
-    border        │              │              │                residual = edge − latency − nearest border
+Each polarity has its own mean latency behind the border of the bit.  What an edge lies off border and latency is the
+measurement of a Kalman filter with two states, phase and period of the clock::
+
+    border        │              │              │                residual = edge − latency − border
     events   + + +│+ + + − −│− − − − − − − −│+ + + + + + +       gain: large after lock, then gentle
-                  │         ▲    │          ▲   │
-                  ├─latency─┘    │     edge of + with its own latency
+    sum     ╱    ╱ ╲                        ╱
+                  ├─latency─┘    ├─latency──┘ its own
 
 While frames are not confirmed the filter only predicts: noise must not walk the clock away.
 """
@@ -23,144 +26,253 @@ from numpy.typing import NDArray
 
 from beacon_comm.core.likelihood import COUNTS, SUB_SLOTS
 
-EDGE_RUN = 4
-"""So many consecutive events of the opposite polarity are an edge."""
+EDGE_LAG = 2
+"""An edge is located when so many bits after it are there: by then the bits beside it are decided."""
+
+FINE = 32
+"""Bins of a bit in which an edge is located."""
+
+UNSURE_PHASE, EDGE_RUN, SUDDEN = 0.08, 4, 0.3
+"""A phase less sure than this (bit) after a long idle line is set by the next fall, before the bits behind it are counted:
+the first of so many OFF events in a row, in a time in which so many OFF events at most were to be expected."""
+
+RISE_DEVIATIONS = 2.0
+"""The signed events that follow an edge sum up to so many standard deviations of noise, which takes 4 at least."""
 
 PHASE_NOISE = 1e-3
 """Standard deviation of the clock's phase jitter over one bit (bit)."""
 
-PERIOD_NOISE = 2e-5
+PERIOD_NOISE = 1e-5
 """Standard deviation of the change of the clock's period from bit to bit (share of the period)."""
 
+BIAS_GAIN, MOST_BIAS, AGILE_NOISE = 0.1, 0.5, 1e-3
+"""Where the residuals' running mean (standard deviations) leaves the second, the period changes faster: so much more for each
+standard deviation beyond (share of the period)."""
+
 LATENCY_GAIN = 0.01
-"""Share of a residual that goes into the difference between the two latencies."""
+"""Share of a residual that goes into the difference between the latencies."""
 
 LEAST_RESIDUAL = 0.02
 """The residuals' standard deviation is never taken for smaller (bit)."""
 
 GATE = 0.4
-"""Residuals beyond this are no edges of this clock (bit)."""
+"""Edges are looked for within so much of where they are expected (bit)."""
 
 PULL = 0.05
 """The period stays within so much of the one at lock (share)."""
+
+OUTLIER_DEVIATIONS = 4.0
+"""Edges farther off than so many standard deviations are none: a bit was decided wrongly."""
 
 MOST_PERIOD_ERROR = 0.003
 MOST_PHASE_ERROR = 0.3
 """What is known of period (share) and phase (bit) is never taken for worse."""
 
-# Values of the clock: times in ns from the demodulator's origin; SHIFT and STRETCH are what the edges of the present
-# bit say, applied at its end.
-BORDER, PERIOD, LATENCY_ON, LATENCY_OFF, VARIANCE, P_PHASE = range(6)
-P_CROSS, P_PERIOD, RUN_SINCE, FIRST_PERIOD, SHIFT, STRETCH = range(6, 12)
-# Whole numbers of the clock: polarity of the line's last edge, polarity and length of the present run of events.
-LEVEL, RUN_POLARITY, RUN_LENGTH, FROZEN = range(4)
+# Values of the clock: times in ns from the demodulator's origin; SHIFT and STRETCH are what the edge located at the end
+# of the present bit says.
+BORDER, PERIOD, VARIANCE, P_PHASE, P_CROSS, P_PERIOD = range(6)
+FIRST_PERIOD, SHIFT, STRETCH, BIAS, RUN_SINCE = range(6, 11)
+
+OFF, ON = range(2)
+"""Kinds of edges, places in the latencies."""
 
 
 class BitClock(NamedTuple):
     """State of the clock and of the bit that is being counted.
 
     Attributes:
-        values: see the constants above, ``(12,)`` float64.
-        numbers: likewise, ``(4,)`` int64.
+        values: see the constants above, ``(11,)`` float64.
+        latencies: of the edges to OFF and to ON behind the borders (ns), ``(2,)`` float64.
+        frozen: whether it only predicts, ``(1,)`` bool.
         counts: events of the present bit, ``(COUNTS,)`` int64.
+        signed: signed events of the present bit (the last row) and of those before it in their bins,
+            ``(EDGE_LAG + 2, FINE)`` int64.
+        events: all events of these bits, ``(EDGE_LAG + 2,)`` int64.
+        shifts: by how much the border of each of these bits was corrected (ns), ``(EDGE_LAG + 2,)`` float64.
+        run: OFF events in a row, counted while the phase is unsure, ``(1,)`` int64.
     """
 
     values: NDArray[np.float64]
-    numbers: NDArray[np.int64]
+    latencies: NDArray[np.float64]
+    frozen: NDArray[np.bool_]
     counts: NDArray[np.int64]
+    signed: NDArray[np.int64]
+    events: NDArray[np.int64]
+    shifts: NDArray[np.float64]
+    run: NDArray[np.int64]
 
 
-def make_clock(border: float, period: float, latency: tuple[float, float], spread: float, period_error: float) -> BitClock:
+def make_clock(
+    border: float, period: float, latencies: NDArray[np.float64], spread: float, period_error: float
+) -> BitClock:
     """Return a clock.
 
     Args:
         border: where a bit begins (ns from the origin).
         period: of a bit (ns).
-        latency: of the edges to ON and to OFF behind the border (ns).
+        latencies: of the edges to OFF and to ON behind the border (ns), ``(2,)`` float64.
         spread: standard deviation of an edge's residual (bit).
         period_error: standard deviation of the period (share of it).
     """
-    values = np.zeros(12)
-    values[[BORDER, PERIOD, LATENCY_ON, LATENCY_OFF, FIRST_PERIOD]] = border, period, *latency, period
+    values = np.zeros(11)
+    values[[BORDER, PERIOD, FIRST_PERIOD]] = border, period, period
     values[VARIANCE] = max(spread, LEAST_RESIDUAL) ** 2
     values[P_PHASE] = 0.05**2
     values[P_PERIOD] = period_error**2
-    return BitClock(values, np.zeros(4, np.int64), np.zeros(COUNTS, np.int64))
+    rows = EDGE_LAG + 2
+    return BitClock(
+        values,
+        latencies.astype(np.float64),
+        np.zeros(1, np.bool_),
+        np.zeros(COUNTS, np.int64),
+        np.zeros((rows, FINE), np.int64),
+        np.zeros(rows, np.int64),
+        np.zeros(rows),
+        np.zeros(1, np.int64),
+    )
 
 
 @njit(cache=True, nogil=True)
-def take_events(values, numbers, counts, t, polarity, first, sign):  # type: ignore[no-untyped-def]
-    """Count the events of the present bit and let the clock see the edges in it.
+def take_events(clock, t, polarity, first, sign):  # type: ignore[no-untyped-def]
+    """Count the events of the present bit.
 
     Args:
-        values, numbers, counts: a :class:`BitClock`'s.
+        clock: changed in place.
         t, polarity: events, ns (float64) and ±1 (int8), from ``first`` on.
         sign: -1 if ON and OFF change places, else 1.
 
     Returns:
         index of the first event behind the bit.
     """
-    border, per_slot = values[BORDER], SUB_SLOTS / values[PERIOD]
+    values, counts, signed = clock.values, clock.counts, clock.signed[-1]
+    border, per_bin = values[BORDER], FINE / values[PERIOD]
     stop = border + values[PERIOD]
-    run_polarity, run_length, level = numbers[RUN_POLARITY], numbers[RUN_LENGTH], numbers[LEVEL]
+    unsure = values[P_PHASE] > UNSURE_PHASE * UNSURE_PHASE and not clock.frozen[0]
     i = first
     while i < len(t):
         at = t[i]
         if at >= stop:
             break
         here = sign * polarity[i]
-        slot = min(max(int((at - border) * per_slot), 0), SUB_SLOTS - 1)
+        if unsure and _falls(clock, at, here):
+            unsure = False
+            border = values[BORDER]
+            stop = border + values[PERIOD]
+        place = min(max(int((at - border) * per_bin), 0), FINE - 1)
+        slot = place // (FINE // SUB_SLOTS)
         counts[slot if here > 0 else SUB_SLOTS + slot] += 1
-        if here == run_polarity:
-            run_length += 1
-        else:
-            run_polarity, run_length = here, 1
-            values[RUN_SINCE] = at
-        if run_length == EDGE_RUN and level != here:
-            if level != 0 and not numbers[FROZEN]:
-                _follow(values, values[RUN_SINCE], here)
-            level = here
+        signed[place] += here
         i += 1
-    numbers[RUN_POLARITY], numbers[RUN_LENGTH], numbers[LEVEL] = run_polarity, run_length, level
+    clock.events[-1] += i - first
     return i
 
 
 @njit(cache=True, nogil=True)
-def _follow(values, edge, polarity):  # type: ignore[no-untyped-def]
-    """Correct phase and period by one edge."""
-    latency = LATENCY_ON if polarity > 0 else LATENCY_OFF
-    off = (edge - values[latency] - values[BORDER] - values[SHIFT]) / values[PERIOD]
-    residual = off - math.floor(off + 0.5)
-    if abs(residual) > GATE:
+def _falls(clock, at, polarity):  # type: ignore[no-untyped-def]
+    """Take an event after a long idle line; return whether it is the ``EDGE_RUN``th of a fall, which sets the phase."""
+    values, run = clock.values, clock.run
+    if polarity > 0:
+        run[0] = 0
+        return False
+    if run[0] == 0:
+        values[RUN_SINCE] = at
+    run[0] += 1
+    if run[0] < EDGE_RUN:
+        return False
+    run[0] = 0
+    usual = 0.5 * (clock.events[:-1].sum() - clock.signed[:-1].sum()) + 1.0
+    if (at - values[RUN_SINCE]) * usual > SUDDEN * (EDGE_LAG + 1) * values[PERIOD]:
+        return False
+    off = (values[RUN_SINCE] - clock.latencies[OFF] - values[BORDER]) / values[PERIOD]
+    _follow(values, clock.latencies, OFF, off - math.floor(off + 0.5))
+    values[BORDER] += values[SHIFT]
+    values[SHIFT] = 0.0
+    return True
+
+
+@njit(cache=True, nogil=True)
+def see_edge(clock, to):  # type: ignore[no-untyped-def]
+    """Correct phase and period by the edge before the bit ``EDGE_LAG`` back, where the decided bits change.
+
+    Args:
+        clock: with all events of the present bit; changed in place.
+        to: ``ON`` where the bits change to 1, else ``OFF``.
+    """
+    if clock.frozen[0]:
         return
+    values = clock.values
+    late = clock.latencies[to] / values[PERIOD]
+    begin = FINE + int(round((late - GATE) * FINE))
+    stop = FINE + int(round((late + GATE) * FINE))
+    begin, stop = max(begin, 0), min(stop, (EDGE_LAG + 2) * FINE)
+    up = 1 if to == ON else -1
+    total, least, rise, events = 0, 0, 0, 0
+    for k in range(begin, stop):
+        total += up * clock.signed[k // FINE, k % FINE]
+        least = min(least, total)
+        rise = max(rise, total - least)
+    for row in range(begin // FINE, (stop - 1) // FINE + 1):
+        events += clock.events[row]
+    if rise == 0 or rise * rise < RISE_DEVIATIONS * RISE_DEVIATIONS * events:
+        return
+    level, lowest, at = 0.0, 0.0, begin
+    for k in range(begin, stop):
+        if level <= lowest:
+            lowest, at = level, k
+        level += up * clock.signed[k // FINE, k % FINE] - rise / FINE
+    if at == begin:
+        return
+    since = clock.shifts[-1]
+    for row in range(2, EDGE_LAG + 1):
+        since += clock.shifts[row]
+    residual = (at + 0.5) / FINE - 1.0 - late - since / values[PERIOD]
+    deviations = residual / math.sqrt(values[P_PHASE] + values[VARIANCE])
+    bounded = min(max(deviations, -OUTLIER_DEVIATIONS), OUTLIER_DEVIATIONS)
+    values[BIAS] += BIAS_GAIN * (bounded - values[BIAS])
+    if bounded == deviations:
+        _follow(values, clock.latencies, to, residual)
+
+
+@njit(cache=True, nogil=True)
+def _follow(values, latencies, to, residual):  # type: ignore[no-untyped-def]
+    """Correct phase and period by what an edge to OFF or to ON lies off (bit)."""
     variance = values[VARIANCE]
     innovation = values[P_PHASE] + variance
     gain, gain_period = values[P_PHASE] / innovation, values[P_CROSS] / innovation
-    values[SHIFT] += gain * residual * values[PERIOD]
-    values[STRETCH] += gain_period * residual
+    values[SHIFT] = gain * residual * values[PERIOD]
+    values[STRETCH] = gain_period * residual
     values[P_PERIOD] -= gain_period * values[P_CROSS]
     values[P_CROSS] *= 1.0 - gain
     values[P_PHASE] *= 1.0 - gain
     values[VARIANCE] = max(variance + 0.02 * (residual * residual - variance), LEAST_RESIDUAL * LEAST_RESIDUAL)
     share = 0.5 * LATENCY_GAIN * residual * values[PERIOD]
-    values[latency] += share
-    values[LATENCY_ON + LATENCY_OFF - latency] -= share
+    latencies[to] += share
+    latencies[1 - to] -= share  # their mean is the phase
 
 
 @njit(cache=True, nogil=True)
-def go_on(values, counts, bits):  # type: ignore[no-untyped-def]
-    """Go on by some bits: predict, and clear the counts; the arrays are a :class:`BitClock`'s."""
+def go_on(clock, bits):  # type: ignore[no-untyped-def]
+    """Go on by some bits: predict, and begin to count anew; ``clock`` is changed in place."""
+    values = clock.values
+    for row in range(EDGE_LAG + 1):
+        clock.signed[row] = clock.signed[row + 1]
+        clock.events[row] = clock.events[row + 1]
+        clock.shifts[row] = clock.shifts[row + 1]
+    clock.counts[:] = 0
+    clock.signed[-1] = 0
+    clock.events[-1] = 0
+    clock.shifts[-1] = values[SHIFT]
     values[BORDER] += values[SHIFT] + bits * values[PERIOD]
     period = values[PERIOD] * (1.0 + values[STRETCH])
     values[PERIOD] = min(max(period, values[FIRST_PERIOD] * (1.0 - PULL)), values[FIRST_PERIOD] * (1.0 + PULL))
     values[SHIFT], values[STRETCH] = 0.0, 0.0
     values[P_PHASE] += bits * (2.0 * values[P_CROSS] + bits * values[P_PERIOD] + PHASE_NOISE * PHASE_NOISE)
     values[P_CROSS] += bits * values[P_PERIOD]
-    values[P_PERIOD] += bits * PERIOD_NOISE * PERIOD_NOISE
+    agile = AGILE_NOISE * max(abs(values[BIAS]) - MOST_BIAS, 0.0)
+    values[P_PERIOD] += bits * (PERIOD_NOISE * PERIOD_NOISE + agile * agile)
     if values[P_PERIOD] > MOST_PERIOD_ERROR * MOST_PERIOD_ERROR:
         values[P_CROSS] *= MOST_PERIOD_ERROR / math.sqrt(values[P_PERIOD])
         values[P_PERIOD] = MOST_PERIOD_ERROR * MOST_PERIOD_ERROR
     if values[P_PHASE] > MOST_PHASE_ERROR * MOST_PHASE_ERROR:
         values[P_CROSS] *= MOST_PHASE_ERROR / math.sqrt(values[P_PHASE])
         values[P_PHASE] = MOST_PHASE_ERROR * MOST_PHASE_ERROR
-    counts[:] = 0

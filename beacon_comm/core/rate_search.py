@@ -26,15 +26,13 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from beacon_comm.core.acquisition import FEW_CHANGES, Demands
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.parameters import Parameters
 
 LISTED_SPREAD = 0.025
 """A clock's rate is looked for within so much of its nominal value."""
-
-TRIED = 4
-"""Periods of a group that are read."""
 
 PERIOD_STEP = 0.15
 """Periods are tried so close that the window's ends move by so much (bit)."""
@@ -58,12 +56,6 @@ OCTAVE_OVERLAP = 0.025
 BINS_PER_BIT = 4
 """Bins in a bit of an octave's fastest rate."""
 
-EDGE_SPREAD = 0.22
-"""Edges spread farther about the bit grid (bit) are those of another rate: the recordings' have 0.07 to 0.16."""
-
-TRUSTED_SHARE = 0.7
-"""Words of a listed rate that cover so much of a window need no sharp edges."""
-
 COMB = 8
 """Multiples of a character's duration that are summed."""
 
@@ -73,19 +65,19 @@ NAMED = 2
 NAMED_SPREAD = 0.004
 """They are right to within this share."""
 
-SHORT_WINDOW, LONG_WINDOW = 8, 25
-"""Characters of a window: later attempts alternate between the two."""
+SHORT_WINDOW, LONG_WINDOW, LONGEST_WINDOW = 8, 25, 90
+"""Characters of a window: later attempts take turns with them.  Pauses between the characters need long ones."""
 
 EXHAUSTED_AT = 60
 """Nothing found in so many characters: there is no such beacon."""
 
-READ_BACK_CHARACTERS = 60
+READ_BACK_CHARACTERS = 100
 """What was said before a lock is read from the buffer, so many characters back at most."""
 
 KEPT_CHARACTERS = READ_BACK_CHARACTERS + LONG_WINDOW + 5
 
-LISTED_NEEDED, BLIND_NEEDED = 4, 8
-"""Words that have to pass for a lock."""
+LISTED_DEMANDS = Demands(needed=4)
+BLIND_DEMANDS = Demands(needed=8, tried=1, least_changes=FEW_CHANGES, most_stray=0.1)
 
 
 class RateSearch:
@@ -94,28 +86,22 @@ class RateSearch:
     Args:
         bit_rate_bps: nominal rate, or the slowest of several (bit/s).
         frame: character frame.
-        needed: words that have to pass.
+        demands: what a lock has to show.
         attempts: number of characters after the first event at which attempts are made, the first ones.
 
     Attributes:
         period: nominal period of a bit, or the longest of several (ns).
-        needed: words that have to pass.
-        tried: periods of each group that are read, those with the widest eye.
-        most_spread: of the edges about the bit grid (bit) up to which a lock is believed.
-        trusted_share: see :func:`beacon_comm.core.acquisition.acquire`.
+        demands: what a lock has to show.
         most_step: attempts are at most so many characters apart.
         longest: events so far back may still be needed (ns).
     """
 
-    def __init__(self, bit_rate_bps: float, frame: CharacterFrame, needed: int, attempts: tuple[int, ...]) -> None:
+    def __init__(self, bit_rate_bps: float, frame: CharacterFrame, demands: Demands, attempts: tuple[int, ...]) -> None:
         self.period = NS_PER_S / bit_rate_bps
-        self.needed = needed
+        self.demands = demands
         self._character = frame.duration_ns(bit_rate_bps)
         self._length = frame.length
         self._attempts = attempts
-        self.tried = TRIED
-        self.most_spread = EDGE_SPREAD
-        self.trusted_share = TRUSTED_SHARE
         self.most_step = MOST_STEP
         self.longest = KEPT_CHARACTERS * self._character
         self.restart(0.0)
@@ -151,7 +137,8 @@ class RateSearch:
         short = max(SHORT_WINDOW, self._attempts[0])
         characters = self._at
         if characters > short:
-            characters = short if self._made % 2 else min(characters, LONG_WINDOW)
+            longest = LONGEST_WINDOW if self._made >= len(self._attempts) and self._made % 4 == 0 else LONG_WINDOW
+            characters = short if self._made % 2 else min(characters, longest)
         begin = max(first, int(np.searchsorted(t, now - characters * self._character)))
         if begin >= stop or t[stop - 1] < now - SHORT_WINDOW * self._character:
             return None
@@ -174,7 +161,7 @@ class ListedSearch(RateSearch):
     """Looks for a listed rate (bit/s)."""
 
     def __init__(self, bit_rate_bps: float, frame: CharacterFrame) -> None:
-        super().__init__(bit_rate_bps, frame, LISTED_NEEDED, LISTED_ATTEMPTS)
+        super().__init__(bit_rate_bps, frame, LISTED_DEMANDS, LISTED_ATTEMPTS)
 
     def periods(self, t: NDArray[np.float64], polarity: NDArray[np.int8]) -> Iterator[NDArray[np.float64]]:
         """Yield the periods around the nominal one."""
@@ -186,9 +173,7 @@ class OctaveSearch(RateSearch):
     """Looks for any rate from the slowest one to twice that (bit/s)."""
 
     def __init__(self, slowest_bps: float, frame: CharacterFrame) -> None:
-        super().__init__(slowest_bps, frame, BLIND_NEEDED, BLIND_ATTEMPTS)
-        self.tried = 1
-        self.trusted_share = math.inf
+        super().__init__(slowest_bps, frame, BLIND_DEMANDS, BLIND_ATTEMPTS)
         self.most_step = max(MOST_STEP, BLIND_STEP_NS / self._character)
 
     def periods(self, t: NDArray[np.float64], polarity: NDArray[np.int8]) -> Iterator[NDArray[np.float64]]:

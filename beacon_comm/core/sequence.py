@@ -18,15 +18,15 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from beacon_comm.core.acquisition import Lock, acquire
-from beacon_comm.core.bit_clock import BORDER, P_PERIOD, PERIOD
+from beacon_comm.core.acquisition import Demands, Lock, acquire
+from beacon_comm.core.bit_clock import BORDER, P_CROSS, P_PERIOD, P_PHASE, PERIOD
 from beacon_comm.core.character import Character, Status
 from beacon_comm.core.event_buffer import EVENT_BYTES
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.likelihood import MEMORY_BITS, compression_table
 from beacon_comm.core.parameters import Parameters
-from beacon_comm.core.rate_search import READ_BACK_CHARACTERS, TRIED, RateSearch, make_searches
+from beacon_comm.core.rate_search import READ_BACK_CHARACTERS, RateSearch, make_searches
 from beacon_comm.core.sequence_detection import (
     BORDER_OF_START,
     FIRST_RATIO,
@@ -57,6 +57,8 @@ REFINED_AFTER = 25
 
 REFINED_PERIODS: NDArray[np.float64] = 1.0 + 0.001 * np.arange(-8.0, 9.0)
 """Periods that a refinement looks at, as shares of the clock's."""
+
+REFINED_DEMANDS = Demands(REFINED_AFTER // 2, most_spread=math.inf)
 
 _ROWS = 512
 
@@ -192,8 +194,7 @@ class SequenceDemodulator:
             period * REFINED_PERIODS,
             self._transitions,
             self._compression,
-            REFINED_AFTER // 2,
-            TRIED,
+            REFINED_DEMANDS,
         )
         if better is not None and better.inverted == lock.inverted:
             self._begin(better, max(self._given_to - 2.0 * self._frame.length * period, float(self._t[first])))
@@ -296,10 +297,7 @@ class SequenceDemodulator:
             periods,
             self._transitions,
             self._compression,
-            search.needed,
-            search.tried,
-            search.most_spread,
-            search.trusted_share,
+            search.demands,
         )
 
     def _choose(self, found: RateSearch, now: float, first: int, stop: int, lock: Lock | None) -> Lock | None:
@@ -333,6 +331,9 @@ class SequenceDemodulator:
         values = lock.clock.values
         bits = math.floor((t - values[BORDER]) / lock.period) - (MEMORY_BITS - 1)
         values[BORDER] += bits * lock.period
+        since_middle = bits - 0.5 * len(lock.positions)  # of the window, where the phase is known best
+        values[P_PHASE] += since_middle * since_middle * values[P_PERIOD]
+        values[P_CROSS] += since_middle * values[P_PERIOD]
         positions = lock.positions
         at = min(max(bits, 0), len(positions) - 1)
         framed = np.flatnonzero(positions[at:] < length)

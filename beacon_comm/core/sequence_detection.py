@@ -18,13 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from beacon_comm.core.bit_clock import (
-    BORDER,
-    FROZEN,
-    PERIOD,
-    go_on,
-    take_events,
-)
+from beacon_comm.core.bit_clock import BORDER, EDGE_LAG, PERIOD, go_on, see_edge, take_events
 from beacon_comm.core.likelihood import CONTEXTS, COUNTS, LEVELS, MEMORY_BITS, SUB_SLOTS, learn, logarithms, weigh
 from beacon_comm.core.soft_decision import bit_ratios, margins
 from beacon_comm.core.trellis import NOISE_COST, UNLIKELY, framed_step, free_step
@@ -82,6 +76,12 @@ RARELY_SILENT = 0.02
 Where held bits are often silent, silence says that they are held.
 """
 
+EMPTY_EVIDENCE = 9.0
+"""Bits without any event are erasures, too, where so many follow one another that held bits are so seldom (nat)."""
+
+LEAST_EMPTY, MOST_EMPTY = 0.1, 0.99
+"""The share of held bits without any event is never taken for less or for more."""
+
 LOST_FRAMES = 15
 """So many frames more in doubt than ok, and the lock is given up."""
 
@@ -94,7 +94,7 @@ UNKNOWN_PLACE_COST = 8.0
 RING = 64
 _RING_MASK = RING - 1
 
-GAIN, SILENCE, USUAL = range(3)
+GAIN, SILENCE, USUAL, EMPTY = range(4)
 
 # Whole numbers of the state.
 BIT, LEARNT, NEXT_TABLES, NOISE_RUN, DOUBT, SILENT_RUN, ASLEEP = range(7)
@@ -111,8 +111,8 @@ class Detection(NamedTuple):
     Attributes:
         histograms, tables: see :mod:`beacon_comm.core.likelihood`, ``(CONTEXTS, COUNTS, LEVELS)`` float64.
         means: events of a bit for each context, after the gain, ``(CONTEXTS,)`` float64.
-        levels: ``(3,)`` float64: the gain, by which counts are divided before they are compressed, the share of
-            silent bits in words, and the mean log p of a word's bit (nat).
+        levels: ``(4,)`` float64: the gain, by which counts are divided before they are compressed, the share of
+            silent bits in words, the mean log p of a word's bit (nat), and the share of held bits without any event.
         compression: see :func:`beacon_comm.core.likelihood.compression_table`.
         free_metric, free_bits: of the free trellis, ``(CONTEXTS,)`` float64 and int64 (last 64 bits of the path).
         metric, bits, ends, noises: of the framed trellis, ``(states,)`` float64 and int64: the last 64 bits of the
@@ -147,6 +147,7 @@ def make_detection(
     gain: float,
     silence: float,
     usual: float,
+    empty: float,
     learnt: int,
     compression: NDArray[np.uint8],
     states: int,
@@ -155,7 +156,7 @@ def make_detection(
 
     Args:
         histograms, means: learnt while the lock was sought.
-        gain, silence, usual: see :class:`Detection`.
+        gain, silence, usual, empty: see :class:`Detection`.
         learnt: number of words in the histograms.
         compression: table of compressed counts.
         states: of the framed trellis.
@@ -166,7 +167,7 @@ def make_detection(
         histograms=histograms,
         tables=tables,
         means=means,
-        levels=np.array([gain, silence, usual]),
+        levels=np.array([gain, silence, usual, empty]),
         compression=compression,
         free_metric=np.zeros(CONTEXTS),
         free_bits=np.zeros(CONTEXTS, np.int64),
@@ -212,7 +213,6 @@ def detect(  # type: ignore[no-untyped-def]
         number of rows, number of events taken, and STILL_LOCKED, LOST or FULL (call again with the rest).
     """
     values, numbers, length = clock.values, state.numbers, transitions.length
-    clock_numbers, events = clock.numbers, clock.counts
     sign = -1 if inverted else 1
     i, count = 0, 0
     while True:
@@ -223,11 +223,11 @@ def detect(  # type: ignore[no-untyped-def]
                 return count, i, STILL_LOCKED
             _wake(clock, state, transitions, t[i])
         border = values[BORDER] + values[PERIOD]
-        i = take_events(values, clock_numbers, events, t, polarity, i, sign)
+        i = take_events(clock, t, polarity, i, sign)
         if i == len(t) and t_end < border:
             return count, i, STILL_LOCKED
         count = _close_bit(clock, state, transitions, layout, rows, count)
-        go_on(values, events, 1)
+        go_on(clock, 1)
         if numbers[DOUBT] > LOST_FRAMES * length:
             return count, i, LOST
         if numbers[SILENT_RUN] > SLEEP_FRAMES * length:
@@ -240,8 +240,8 @@ def _wake(clock, state, transitions, t):  # type: ignore[no-untyped-def]
     values = clock.values
     skipped = np.floor((t - values[BORDER]) / values[PERIOD]) - 1.0
     if skipped > 0.0:
-        go_on(values, clock.counts, skipped)
-    clock.numbers[FROZEN] = 0
+        go_on(clock, skipped)
+    clock.frozen[0] = False
     length = transitions.length
     state.metric[:] = UNLIKELY
     state.metric[length * 2 * CONTEXTS + CONTEXTS - 1] = 0.0
@@ -279,6 +279,9 @@ def _close_bit(clock, state, transitions, layout, rows, count):  # type: ignore[
     if numbers[BIT] < MEMORY_BITS - 1 or (silent and silence < RARELY_SILENT):
         likelihoods[:] = 0.0  # an erasure, or before the first event
     _step_free(state, likelihoods)
+    decided = state.free_bits[np.argmax(state.free_metric)] >> EDGE_LAG
+    if (decided ^ decided >> 1) & 1 and numbers[BIT] >= EDGE_LAG + MEMORY_BITS:
+        see_edge(clock, decided & 1)
     _step_framed(state, transitions, likelihoods)
     numbers[BIT] += 1
     best = np.argmax(state.metric)
@@ -328,7 +331,7 @@ def _decide(clock, state, transitions, layout, best, lag, rows, count):  # type:
             _decide_word(clock, state, layout, length, best, at, lag, rows[count])
             count += 1
     elif state.noises[best] >> lag & 1:
-        clock.numbers[FROZEN] = 1
+        clock.frozen[0] = True
         if not state.silent[at & _RING_MASK]:  # silence is not in doubt
             numbers[NOISE_RUN] += 1
             numbers[DOUBT] += 1
@@ -360,11 +363,11 @@ def _decide_word(clock, state, layout, length, best, at, lag, row):  # type: ign
     likelihoods = np.zeros((length + MEMORY_BITS - 1, CONTEXTS))
     erased = 0
     for k in range(len(likelihoods)):
-        if at - length + 1 + k < numbers[BIT]:
-            place = (at - length + 1 + k) & _RING_MASK
-            likelihoods[k] = state.likelihoods[place]
-            if k < length:
-                erased += state.silent[place] and state.levels[SILENCE] < RARELY_SILENT
+        bit = at - length + 1 + k
+        if bit < numbers[BIT] and not _in_gap(state, bit):
+            likelihoods[k] = state.likelihoods[bit & _RING_MASK]
+        if k < length:
+            erased += not likelihoods[k].any()
     frame_margin, word_margin = margins(likelihoods, before, after, word, layout)
     bit_ratios(likelihoods, before, after, length, row[FIRST_RATIO:])
     agreeing, other = UNLIKELY, UNLIKELY
@@ -397,13 +400,26 @@ def _decide_word(clock, state, layout, length, best, at, lag, row):  # type: ign
         _learn_word(state, contexts, first)
         if not erased:
             state.levels[USUAL] += (fit - state.levels[USUAL]) / LEARNING_MEMORY
-    clock.numbers[FROZEN] = 0 if passes else 1
+    clock.frozen[0] = not passes
     row[WORD], row[MARGIN], row[PERIOD_THEN] = word, margin, clock.values[PERIOD]
     if passes and margin >= SEEN_MARGIN:
         row[KIND] = KIND_OK if margin >= OK_MARGIN else KIND_SEEN
     else:
         row[KIND] = KIND_UNREADABLE if erased and margin < READABLE_MARGIN else KIND_REPAIRED
     row[BORDER_OF_START] = state.borders[(at - length + 1) & _RING_MASK]
+
+
+@njit(cache=True, nogil=True)
+def _in_gap(state, bit):  # type: ignore[no-untyped-def]
+    """Return whether a bit lies in so long a run of bits without any event that events were lost."""
+    totals, newest = state.totals, state.numbers[BIT] - 1
+    first = last = bit
+    while totals[first & _RING_MASK] == 0.0 and first > max(newest - RING + 1, 0):
+        first -= 1
+    while totals[last & _RING_MASK] == 0.0 and last < newest:
+        last += 1
+    share = min(max(state.levels[EMPTY], LEAST_EMPTY), MOST_EMPTY)
+    return (last - first - 1) * -np.log(share) > EMPTY_EVIDENCE
 
 
 @njit(cache=True, nogil=True)
@@ -433,6 +449,8 @@ def _learn_word(state, contexts, first):  # type: ignore[no-untyped-def]
     for k in range(len(contexts)):
         context, place = contexts[k], (first + k) & _RING_MASK
         levels[SILENCE] += (silent[place] - levels[SILENCE]) / (LEARNING_MEMORY * len(contexts))
+        if context == 0 or context == CONTEXTS - 1:
+            levels[EMPTY] += ((totals[place] == 0.0) - levels[EMPTY]) / LEARNING_MEMORY
         if silent[place] and levels[SILENCE] < RARELY_SILENT:
             continue
         learn(histograms, counts[place], context, 1.0)
