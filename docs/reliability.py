@@ -134,8 +134,8 @@ def with_events(waveform: Waveform, events: Events) -> Waveform:
 
 
 def thinned(w: Waveform, random: Random) -> Waveform:
-    """50, 25, 10 or 5 % of the events."""
-    share = float(random.choice([0.5, 0.25, 0.1, 0.05]))
+    """25, 10, 5 or 3 % of the events."""
+    share = float(random.choice([0.25, 0.1, 0.05, 0.03]))
     return with_events(w, stress.thinned(w.t_ns, w.polarity, share, seed_from(random)))
 
 
@@ -145,22 +145,22 @@ def clock(w: Waveform, random: Random) -> Waveform:
 
 
 def drifting_clock(w: Waveform, random: Random) -> Waveform:
-    """A clock that swings by 0.1 to 1 % within a second."""
-    return warped(w, stress.drift_warp(w.t_ns, float(random.choice([0.001, 0.002, 0.005, 0.01]))))
+    """A clock that swings by 0.5 to 4 % within a second."""
+    return warped(w, stress.drift_warp(w.t_ns, float(random.choice([0.005, 0.01, 0.02, 0.04]))))
 
 
 def jitter(w: Waveform, random: Random) -> Waveform:
-    """Edges that come early or late, by 5 to 20 % of a bit."""
+    """Edges that come early or late, by 10 to 25 % of a bit."""
     starts_ns = [int(due.t_ns[0]) for due in w.sendings]
-    share = float(random.choice([0.05, 0.1, 0.15, 0.2]))
+    share = float(random.choice([0.1, 0.15, 0.2, 0.25]))
     return with_events(
         w, stress.with_jitter(w.t_ns, w.polarity, w.bit_rate_bps, share, starts_ns, seed_from(random))
     )
 
 
 def background(w: Waveform, random: Random) -> Waveform:
-    """Background events, 0.5 to 2 for each event of the beacon."""
-    ratio = float(random.choice([0.5, 1.0, 1.5, 2.0]))
+    """Background events, 1 to 4 for each event of the beacon."""
+    ratio = float(random.choice([1.0, 2.0, 3.0, 4.0]))
     return with_events(w, stress.with_background(w.t_ns, w.polarity, ratio, seed_from(random)))
 
 
@@ -173,15 +173,15 @@ def gaps(w: Waveform, random: Random) -> Waveform:
 
 
 def fading(w: Waveform, random: Random) -> Waveform:
-    """An amplitude that fades 3:1 to 20:1 within a second."""
-    ratio = float(random.choice([3.0, 10.0, 20.0]))
+    """An amplitude that fades 10:1 to 50:1 within a second."""
+    ratio = float(random.choice([10.0, 20.0, 50.0]))
     return with_events(w, stress.with_fading(w.t_ns, w.polarity, ratio, seed=seed_from(random)))
 
 
 def leak(w: Waveform, random: Random) -> Waveform:
-    """10 to 40 % of the events of the same beacon at another time."""
+    """20 to 60 % of the events of the same beacon at another time."""
     other = stress.from_another_time(w.t_ns, w.polarity, random.uniform(0.2, 0.8))
-    share = float(random.choice([0.1, 0.2, 0.4]))
+    share = float(random.choice([0.2, 0.4, 0.6]))
     return with_events(w, stress.with_leak(w.t_ns, w.polarity, *other, share, seed_from(random)))
 
 
@@ -192,7 +192,7 @@ def faint_in_background(w: Waveform, random: Random) -> Waveform:
 
 
 STRESSES: dict[str, Callable[[Waveform, Random], Waveform]] = {
-    'thinned to 5 to 50 %': thinned,
+    'thinned to 3 to 25 %': thinned,
     'clock up to 2 % off': clock,
     'clock drifting': drifting_clock,
     'jitter, 5 to 20 % of a bit': jitter,
