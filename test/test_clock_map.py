@@ -1,5 +1,7 @@
 """The node's two maps of time: sensor clock to ROS time, and a silent topic's stream time."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -249,3 +251,22 @@ def test_the_stream_never_breaks_its_word(packets: list[tuple[int, int, list[int
         assert all(announced_ns <= t <= admitted.t_end_ns for t in admitted.t_ns.tolist())
         assert [time.sensor_ns(int(t)) for t in admitted.t_ns] == times
         announced_ns = admitted.t_end_ns
+
+
+def test_what_is_missing_is_shifted_with_its_packet() -> None:
+    time = StreamTime(WAIT, LAG)
+    time.admit(batch(START), STAMP)
+    announced_ns = carry_on(time, STAMP, STAMP + 200 * MS)[-1]
+    late = replace(batch(START + 1 * MS, START + 4 * MS), missing_until_ns=START + 1 * MS)
+    assert time.admit(late, STAMP + 205 * MS).missing_until_ns == announced_ns
+
+
+def test_a_topic_whose_packets_are_shed_is_not_silent() -> None:
+    time = StreamTime(WAIT, LAG)
+    time.hear(STAMP)
+    time.admit(batch(START), STAMP)
+    now_ns = STAMP
+    for _ in range(100):
+        now_ns += 20 * MS
+        time.hear(now_ns)
+        assert not carry_on(time, now_ns, now_ns + 20 * MS)

@@ -7,6 +7,9 @@ four parallel arrays, and the time up to which the stream is known:
     every event still to come has      t >= t_end_ns.
 
 A batch without events still moves the stream's time on, so that a silence ends characters and tracks.
+
+Where messages were lost, time is no silence but *missing*: nobody knows what was in it.  The batch after it says so:
+the stream between the batches before and ``missing_until_ns`` is missing.
 """
 
 from __future__ import annotations
@@ -28,6 +31,7 @@ class EventBatch:
         polarity: +1 for a rise, -1 for a fall of brightness, ``(n,)`` int8.
         t_ns: sensor time (ns), non-decreasing, ``(n,)`` int64.
         t_end_ns: the stream's time (ns) after this batch; see the module's head.
+        missing_until_ns: end of the missing stretch before this batch (ns), at most ``t_end_ns``; None without one.
     """
 
     x: NDArray[np.uint16]
@@ -35,6 +39,7 @@ class EventBatch:
     polarity: NDArray[np.int8]
     t_ns: NDArray[np.int64]
     t_end_ns: int
+    missing_until_ns: int | None = None
 
     def __len__(self) -> int:
         return len(self.t_ns)

@@ -64,8 +64,20 @@ class StreamTime:
         self._idle_ns = 0
         self._publisher_gone = False
         if shift_ns or batch.t_end_ns != self._end_ns:
-            batch = replace(batch, t_ns=batch.t_ns + shift_ns, t_end_ns=self._end_ns)
+            missing_ns = batch.missing_until_ns
+            batch = replace(
+                batch,
+                t_ns=batch.t_ns + shift_ns,
+                t_end_ns=self._end_ns,
+                missing_until_ns=None if missing_ns is None else missing_ns + shift_ns,
+            )
         return batch
+
+    def hear(self, now_ns: int) -> None:
+        """Take notice of a packet that is not admitted: the topic is not silent, but unread."""
+        if self._packet_end_ns is not None:
+            self._arrival_ns = now_ns
+            self._idle_ns = 0
 
     def tick(self, now_ns: int, period_ns: int) -> EventBatch | None:
         """Return an empty batch that moves a silent stream's time on, or None; to be called every ``period_ns``.

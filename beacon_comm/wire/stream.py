@@ -2,6 +2,11 @@
 
     message's bytes ──► fields ──► frame, size, encoding, seq looked at ──► payload decoded ──► Decoded
 
+*Order of packets.*  A step of seq by more than one tells of lost packets; the batch that follows says up to where the
+stream is missing.  A packet of a seq up to ``MOST_LATE`` back whose stamp is not newer was overtaken by others: it is
+passed over, like one that comes twice.  A third one in a row is the beginning of a recording played again, or of a
+driver started again.
+
 Everything that can be wrong with a message is counted by kind in :attr:`EventStream.counts` and named in
 :attr:`Decoded.problem`; nothing is raised for bad bytes.
 """
@@ -9,7 +14,7 @@ Everything that can be wrong with a message is counted by kind in :attr:`EventSt
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -39,12 +44,19 @@ ENCODINGS: Mapping[str, Callable[[], PayloadDecoder]] = {
 }
 MAX_SIDE_PX = 1 << 12
 """No event sensor is larger; images of a size that a damaged message names are not to be made."""
+MOST_LATE = 8
+"""Packets by which one may come late."""
+LATE_IN_A_ROW = 2
+"""So many late packets in a row are late; more are a stream that begins anew."""
 
 COUNTS: Mapping[str, str] = {
     'packets': 'messages handed in',
     'events': 'events given out',
     'empty_packets': 'messages read that hold no payload',
     'lost_packets': 'messages that seq tells are missing',
+    'shed_packets': 'messages passed over undecoded because there was no time for them',
+    'repeated_packets': 'messages that came twice: passed over',
+    'overtaken_packets': 'messages that came after later ones: passed over',
     'restarts': 'sensor restarts: event time stepped back by more than 1 s',
     'resizes': 'changes of the sensor size',
     'bad_messages': 'messages whose bytes are not what the type says',
@@ -119,11 +131,13 @@ class EventStream:
         self._tally = np.zeros(len(TALLY_KINDS), np.int64)
         self._frame_id: str | None = None
         self._size: tuple[int, int] | None = None
-        self._seq: int | None = None
-        self._stamp_ns = 0
         self._encoding = ''
         self._decoder: PayloadDecoder | None = None
         self._array_decoder = EventArrayDecoder()
+        self._last: Packet | None = None
+        self._late_in_a_row = 0
+        self._skipped = 0  # messages passed over since the last one that was read
+        self._missing = False  # until events come again
 
     @property
     def counts(self) -> Mapping[str, int]:
@@ -131,6 +145,17 @@ class EventStream:
         for place, kind in enumerate(TALLY_KINDS):
             self._counts[kind] = int(self._tally[place])
         return MappingProxyType(self._counts)
+
+    def shed(self) -> None:
+        """Pass a message over unread: what was in it is missing."""
+        self._counts['packets'] += 1
+        self._counts['shed_packets'] += 1
+        self._skipped += 1
+        self._missing = True
+
+    def lost(self) -> None:
+        """Hear from the middleware that messages were lost; packets know better, by their seq."""
+        self._missing |= self._is_array
 
     def push(self, cdr: Bytes) -> Decoded:
         """Decode one message's CDR bytes; whatever they hold, nothing is raised."""
@@ -143,6 +168,10 @@ class EventStream:
         found = self._find_problem(packet)
         if found is not None:
             return self._problem(packet, *found)
+        out_of_order = self._find_disorder(packet) if isinstance(packet, Packet) else None
+        if out_of_order is not None:
+            self._counts[out_of_order] += 1
+            return Decoded(None, packet.stamp_ns, packet.frame_id, packet.width, packet.height)
         return self._read(packet)
 
     def _find_problem(self, packet: Packet | ArrayPacket) -> tuple[str, str] | None:
@@ -157,6 +186,21 @@ class EventStream:
         if self._frame_id is not None and packet.frame_id != self._frame_id:
             return 'refused_frames', f'second camera {packet.frame_id!r} on the topic of {self._frame_id!r}'
         return None
+
+    def _find_disorder(self, packet: Packet) -> str | None:
+        """Return the kind of a packet that came twice or too late, None for one to be read."""
+        last = self._last
+        if last is None or last.seq is None or packet.seq is None or packet.encoding != last.encoding:
+            return None
+        kind = None
+        if packet.seq == last.seq and packet.stamp_ns == last.stamp_ns and np.array_equal(packet.payload, last.payload):
+            kind = 'repeated_packets'
+        elif last.seq - MOST_LATE <= packet.seq < last.seq and packet.stamp_ns <= last.stamp_ns:
+            kind = 'overtaken_packets'
+        if kind is not None and self._late_in_a_row == LATE_IN_A_ROW:
+            kind = None
+        self._late_in_a_row = 0 if kind is None else self._late_in_a_row + 1
+        return kind
 
     def _problem(self, packet: Packet | ArrayPacket | None, kind: str, text: str) -> Decoded:
         self._counts[kind] += 1
@@ -177,6 +221,10 @@ class EventStream:
         else:
             reading = self._array_decoder.decode(packet, self._tally)
         batch = reading.batch
+        if self._missing and batch is not None and not reading.restarted:
+            batch = replace(batch, missing_until_ns=int(batch.t_ns[0]) if len(batch) else batch.t_end_ns)
+        if reading.restarted or (batch is not None and len(batch)):
+            self._missing = False
         events = 0 if batch is None else len(batch)
         counts = self._counts
         counts['events'] += events
@@ -199,15 +247,18 @@ class EventStream:
 
     def _read_packet(self, packet: Packet) -> tuple[int, Reading]:
         """Return the number of packets missing before this one, and its reading."""
-        step = 0 if self._seq is None or packet.seq is None else packet.seq - self._seq
-        lost = max(step - 1, 0)
-        elapsed_ns = packet.stamp_ns - self._stamp_ns if self._seq is not None else 0
-        self._seq, self._stamp_ns = packet.seq, packet.stamp_ns
+        last, self._last = self._last, packet
+        step = 0 if last is None or last.seq is None or packet.seq is None else packet.seq - last.seq
+        elapsed_ns = 0 if last is None else packet.stamp_ns - last.stamp_ns
+        lost = max(step - 1 - self._skipped, 0)
+        gap = step > 1 or self._skipped > 0
+        self._missing |= gap
+        self._skipped = 0
         changed = self._decoder is not None and packet.encoding != self._encoding
         if self._decoder is None or changed:
             self._decoder = ENCODINGS[packet.encoding]()
             self._encoding = packet.encoding
-        reading = self._decoder.decode(packet, Continuity(elapsed_ns, lost > 0, step < 0), self._tally)
+        reading = self._decoder.decode(packet, Continuity(elapsed_ns, gap, step < 0), self._tally)
         if changed:
             # Another encoding counts time from elsewhere.
             reading = Reading(reading.batch, True, reading.odd_bytes)
