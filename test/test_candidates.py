@@ -50,6 +50,18 @@ class OneEventOneCharacter:
         return held
 
 
+class Aware(OneEventOneCharacter):
+    """A demodulator that is told of gaps."""
+
+    def __init__(self, parameters: Parameters) -> None:
+        super().__init__(parameters)
+        self.told: list[tuple[int, int]] = []
+
+    def miss(self, start_ns: int, stop_ns: int) -> None:
+        """Remember it."""
+        self.told.append((start_ns, stop_ns))
+
+
 class Lamp(OneEventOneCharacter):
     """A demodulator whose every character is ok and the same: for ever a candidate."""
 
@@ -344,3 +356,48 @@ def test_reserved_slots_are_always_there_for_candidates(reserved: int) -> None:
     world.signs |= dict.fromkeys(range(20, 26), -1)
     world.run(1)
     assert list(world.states().values()).count(DEMODULATING) == reserved
+
+
+def starts(world: World) -> list[int]:
+    """Return the hops in which the received characters began."""
+    return [(received.character.t_ns - T0_NS) // HOP_NS for received in world.received]
+
+
+def test_what_overlaps_a_gap_is_erased_and_not_counted() -> None:
+    """A character lies 1 µs behind its hop's beginning, one bit is a tenth of a hop."""
+    world = World(Parameters(), {1: 1}).run(20)
+    bit_ns = HOP_NS // 10
+    world.slots.miss(world.t_ns + HOP_NS + bit_ns, world.t_ns + 3 * HOP_NS)  # into hop 21, to the end of 22
+    world.run(10)
+    # 23 begins within a bit behind the gap.
+    assert starts(world) == [*range(21), *range(24, 30)]
+    assert world.slots.record(1).characters == 27
+    world.slots.miss(world.t_ns + HOP_NS + 2 * bit_ns, world.t_ns + 2 * HOP_NS - 2 * bit_ns)  # within hop 31
+    world.run(5)
+    assert starts(world)[-4:] == [30, 32, 33, 34]
+
+
+def test_a_slot_that_is_given_later_hears_of_the_gaps_in_its_backlog() -> None:
+    made: list[Aware] = []
+
+    def make(parameters: Parameters) -> Aware:
+        made.append(Aware(parameters))
+        return made[-1]
+
+    world = World(Parameters(candidate_slots=1), {1: 1}, make).run(15)
+    world.signs[2] = 1
+    gap = (world.t_ns + 3 * HOP_NS, world.t_ns + 4 * HOP_NS)
+    world.run(3)
+    world.slots.miss(*gap)
+    world.run(7)
+    assert [demodulator.told for demodulator in made] == [[gap], [gap]]
+    of_second = [r.character.t_ns for r in world.received if r.track_id == 2]
+    assert len(of_second) == 10 - 2 and not any(gap[0] <= t < gap[1] for t in of_second)
+
+
+def test_a_new_time_has_no_gaps() -> None:
+    world = World(Parameters(), {1: 1}).run(2)
+    world.slots.miss(world.t_ns, world.t_ns + 3 * HOP_NS)
+    world.slots.forget_gaps()
+    world.run(5)
+    assert starts(world) == list(range(7))

@@ -195,3 +195,17 @@ def test_clock_may_start_anywhere():
         s._replace(start_ns=s.start_ns - 2**40, stop_ns=s.stop_ns - 2**40, decided_ns=s.decided_ns - 2**40)
         for s in shifted
     ] == expected
+
+
+def test_frames_run_on_through_missing_events():
+    """Behind a gap the level may be the other one: neither a break nor an idle line is to be seen in it."""
+    for start_bits, stop_bits in [(14.3, 17.8), (30.2, 42.1), (12.0, 33.0)]:
+        line = line_edges(text_bits('Shall I compare'), 1000.0)
+        before, after = line.t_ns < start_bits * BIT, line.t_ns >= stop_bits * BIT
+        sync = synchroniser()
+        spans = sync.push(Edges(line.t_ns[before], line.rising[before]), int(start_bits * BIT))
+        sync.miss(int(stop_bits * BIT))
+        spans += sync.push(Edges(line.t_ns[after], line.rising[after]), 400 * BIT)
+        starts = {round(span.start_ns / BIT, 3) for span in spans}
+        assert starts >= {11.0 * k for k in range(15) if not start_bits - 11 < 11 * k < stop_bits + 11}
+        assert all(start % 11 == 0 for start in starts)

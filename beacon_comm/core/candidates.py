@@ -14,10 +14,14 @@ next candidate: there are always ``max(candidate_slots - confirmed, reserved_can
 
 Slots change hands only in :meth:`CandidateSlots.assign`, on the hop grid of event time, and everything that decides
 about it is a function of the events before that hop: however the stream is cut into batches, the result is the same.
+
+Where events are missing, characters are *erased*: those that overlap the gap or begin within ``UNSETTLED_BITS`` behind it
+are neither given out nor counted, whatever a demodulator made of the hole.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
@@ -27,10 +31,15 @@ from numpy.typing import NDArray
 
 from beacon_comm.core.character import Character
 from beacon_comm.core.confirmation import ParityRecord
-from beacon_comm.core.demodulator import Demodulator
+from beacon_comm.core.demodulator import Demodulator, GapAware
+from beacon_comm.core.event_buffer import buffer_length_ns
+from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.routing import Routed
 from beacon_comm.core.tracks import Track
+
+UNSETTLED_BITS = 1.0
+"""An edge so close behind a gap (bit) may be the gap's end, and not the line's."""
 
 Times = NDArray[np.int64]
 Polarities = NDArray[np.int8]
@@ -60,19 +69,64 @@ class ReceivedCharacter:
     character: Character
 
 
+class Gaps:
+    """Stretches of the stream whose events are missing.
+
+    Args:
+        kept_ns: gaps that ended longer ago than this (ns) are forgotten.
+    """
+
+    def __init__(self, kept_ns: int) -> None:
+        self._kept_ns = kept_ns
+        self._starts: list[int] = []
+        self._stops: list[int] = []
+
+    def add(self, start_ns: int, stop_ns: int) -> None:
+        """Take a gap (ns) behind those before."""
+        old = bisect_right(self._stops, start_ns - self._kept_ns)
+        del self._starts[:old], self._stops[:old]
+        self._starts.append(start_ns)
+        self._stops.append(stop_ns)
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._starts.clear()
+        self._stops.clear()
+
+    def since(self, t_ns: int) -> list[tuple[int, int]]:
+        """Return the gaps that end after a time (ns), each with its start."""
+        first = bisect_right(self._stops, t_ns)
+        return list(zip(self._starts[first:], self._stops[first:], strict=True))
+
+    def erase(self, character: Character, end_ns: int) -> bool:
+        """Tell whether a character that ends at ``end_ns`` overlaps a gap, or begins too close behind one."""
+        unsettled_ns = round(UNSETTLED_BITS * NS_PER_S / character.bit_rate_bps)
+        first = bisect_right(self._stops, character.t_ns - unsettled_ns)
+        return first < len(self._starts) and self._starts[first] < end_ns
+
+
 @dataclass(slots=True)
 class _Slot:
     demodulator: Demodulator
     record: ParityRecord
+    gaps: Gaps
     read_to_ns: int | None
-    """End of the last character that was given out, in this turn or the ones before it."""
+    """End of the last character that was given out or erased, in this turn or the ones before it."""
 
     def judge(self, track_id: int, characters: list[Character]) -> list[ReceivedCharacter]:
+        received = []
         for character in characters:
-            self.record.push(character)
             end_ns = self.record.end_of(character)
             self.read_to_ns = end_ns if self.read_to_ns is None else max(self.read_to_ns, end_ns)
-        return [ReceivedCharacter(track_id, character) for character in characters]
+            if self.gaps.erase(character, end_ns):
+                continue
+            self.record.push(character)
+            received.append(ReceivedCharacter(track_id, character))
+        return received
+
+    def miss(self, start_ns: int, stop_ns: int) -> None:
+        if isinstance(self.demodulator, GapAware):
+            self.demodulator.miss(start_ns, stop_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +156,19 @@ class CandidateSlots:
         self._slots: dict[int, _Slot] = {}
         self._tried: dict[int, _Tried] = {}
         self._slots_full = False
+        self._gaps = Gaps(2 * buffer_length_ns(parameters))
+
+    def miss(self, start_ns: int, stop_ns: int) -> None:
+        """Hear that the events of the stream from ``start_ns``, up to which it is known, to ``stop_ns`` (ns) are missing."""
+        if stop_ns <= start_ns:
+            return
+        self._gaps.add(start_ns, stop_ns)
+        for slot in self._slots.values():
+            slot.miss(start_ns, stop_ns)
+
+    def forget_gaps(self) -> None:
+        """Begin a new time."""
+        self._gaps.clear()
 
     def assign(self, tracks: Mapping[int, Track], t_ns: int, backlog: Backlog) -> list[ReceivedCharacter]:
         """Free the slots of demoted tracks and give free ones to the queue.
@@ -239,9 +306,16 @@ class CandidateSlots:
         tried = self._tried.pop(track_id, None)
         read_to_ns = None if tried is None else tried.read_to_ns
         first = 0 if read_to_ns is None else int(np.searchsorted(times, read_to_ns, 'left'))
-        slot = self._slots[track_id] = _Slot(self._make_demodulator(self._p), ParityRecord(self._p), read_to_ns)
+        slot = _Slot(self._make_demodulator(self._p), ParityRecord(self._p), self._gaps, read_to_ns)
+        self._slots[track_id] = slot
         slot.record.advance(t_ns, quiet=False)
-        return slot.judge(track_id, slot.demodulator.push(times[first:], polarity[first:], t_ns))
+        received = []
+        for start_ns, stop_ns in self._gaps.since(int(times[first])) if first < len(times) else ():
+            stop = max(first, int(np.searchsorted(times, start_ns, 'right')))
+            received += slot.judge(track_id, slot.demodulator.push(times[first:stop], polarity[first:stop], start_ns))
+            slot.miss(start_ns, stop_ns)
+            first = stop
+        return received + slot.judge(track_id, slot.demodulator.push(times[first:], polarity[first:], t_ns))
 
 
 def _by_time(received: ReceivedCharacter) -> tuple[int, int]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from beacon_comm.core.rate_bank import RateBank
 from beacon_comm.core.sequence import SequenceDemodulator
 from beacon_comm.core.threshold import ThresholdDemodulator
 
-__all__ = ['Demodulator', 'RateBank', 'SequenceDemodulator', 'ThresholdDemodulator', 'make_demodulator']
+__all__ = ['Demodulator', 'GapAware', 'RateBank', 'SequenceDemodulator', 'ThresholdDemodulator', 'make_demodulator']
 
 
 class Demodulator(Protocol):
@@ -46,6 +46,18 @@ class Demodulator(Protocol):
     @property
     def given_up(self) -> bool:
         """Whether it has looked long enough to say that there is no beacon; it goes on looking all the same."""
+        ...
+
+
+@runtime_checkable
+class GapAware(Protocol):
+    """A demodulator that can be told of missing events; another one takes a gap for a silence."""
+
+    def miss(self, start_ns: int, stop_ns: int) -> None:
+        """Know nothing of the stream from ``start_ns``, up to which it has been pushed, to ``stop_ns`` (ns).
+
+        Characters that overlap it need not be held back: the slot erases them.
+        """
         ...
 
 

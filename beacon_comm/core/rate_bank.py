@@ -159,6 +159,12 @@ class RateBank(GivenRate):
             self._decided += [(rate, reading) for reading in rate.demodulator.push_readings(t_ns, polarity, t_end_ns)]
         return self._weigh(t_end_ns)
 
+    def miss(self, start_ns: int, stop_ns: int) -> None:
+        """Hear of missing events; see :class:`beacon_comm.core.demodulator.GapAware`."""
+        demodulators = [rate.demodulator for rate in self._rates] if self._settled is None else [self._settled]
+        for demodulator in demodulators:
+            demodulator.miss(start_ns, stop_ns)
+
     def flush(self) -> list[Character]:
         """End the stream; if no rate is settled, give the characters of the one that explains most out."""
         if self._settled is not None:

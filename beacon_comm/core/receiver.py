@@ -139,6 +139,8 @@ class Receiver:
         """
         characters: list[ReceivedCharacter] = []
         lost: list[BeaconSnapshot] = []
+        if batch.missing_until_ns is not None and self._t_ns is not None:
+            self._slots.miss(self._t_ns, batch.missing_until_ns)
         for segment, at_hop in self._segments(batch):
             routed = self._detection.route(segment)
             characters += self._slots.demodulate(routed, segment.t_end_ns)
@@ -159,6 +161,7 @@ class Receiver:
     def reset(self) -> Output:
         """Go on after the sensor's clock was restarted: all tracks are lost, labels go on, time starts anew."""
         output = self._restart(self._detection.reset())
+        self._slots.forget_gaps()
         self._t_ns = None
         return output
 

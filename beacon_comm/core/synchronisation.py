@@ -127,6 +127,18 @@ class EndBitSynchroniser:
         self._t_end_ns = t_end_ns
         return _as_spans(spans[:count])
 
+    def miss(self, stop_ns: int) -> None:
+        """Know nothing of the line from now to ``stop_ns`` (ns): frames run on.
+
+        The level may have changed unseen, and then so does the next edge pass: it says nothing for a character more.
+        """
+        self._states[:, _CHANGED] = stop_ns + self._durations[0]
+
+    def lose(self) -> None:
+        """Give every trial's synchronisation up."""
+        self._states[:, _IN_FRAME] = 0
+        self._states[:, _EDGES_TO_SKIP] = self._states[:, _TRIAL]
+
     def flush(self) -> list[Span]:
         """End the stream: return the character that has come as far as the middle of its last bit, if there is one."""
         spans = np.empty((len(self._states), _SPAN_SIZE), np.int64)

@@ -7,6 +7,9 @@
 The synchroniser runs several trials (see :mod:`beacon_comm.core.synchronisation`).  One of them *leads*: its
 characters go out as soon as they are decided.  Another one takes the lead once its last five characters are all ok
 while the leader's ok characters cover less than half of the same time.
+
+Where events are missing the frames run on by the nominal clock, for as long as it is good for; behind a longer gap nobody
+leads until one has earned it.
 """
 
 from __future__ import annotations
@@ -28,6 +31,15 @@ from beacon_comm.core.synchronisation import EndBitSynchroniser, Span
 
 LEAD_CHARACTERS = 5
 """So many ok characters in a row give a trial the lead."""
+
+COASTED_CHARACTERS = 4
+"""The clock is carried through a gap of so many characters: 44 bits at 1 % are the half bit that the window has."""
+
+REGAINED_CHARACTERS = 8
+"""So many ok characters in a row give the lead where nobody has it: there is no leader to compare with."""
+
+NOBODY = -1
+"""The leader after a longer gap."""
 
 REMEMBERED_CHARACTERS = 30
 """Characters that are remembered of each trial."""
@@ -102,6 +114,7 @@ class ThresholdDemodulator(GivenRate):
         self._bit_rate_bps = bit_rate_bps
         self._filter = HighPassFilter(bit_rate_bps, parameters)
         self._synchroniser = EndBitSynchroniser(bit_rate_bps, frame, parameters.idle_start, trials)
+        self._coasted_ns = round(COASTED_CHARACTERS * frame.duration_ns(bit_rate_bps))
         self._reader = CharacterReader(bit_rate_bps, frame)
         self._record = EdgeRecord()
         self._recent: list[deque[Reading]] = [deque(maxlen=REMEMBERED_CHARACTERS) for _ in range(trials)]
@@ -120,6 +133,16 @@ class ThresholdDemodulator(GivenRate):
     def flush(self) -> list[Character]:
         """End the stream; see :class:`beacon_comm.core.demodulator.Demodulator`."""
         return self._given.take(self.flush_readings())
+
+    def miss(self, start_ns: int, stop_ns: int) -> None:
+        """Hear of missing events; see :class:`beacon_comm.core.demodulator.GapAware`."""
+        self._synchroniser.miss(stop_ns)
+        if stop_ns - start_ns > self._coasted_ns:
+            self._synchroniser.lose()
+            if len(self._recent) > 1:
+                self._leader = NOBODY
+                for recent in self._recent:
+                    recent.clear()
 
     def push_readings(self, t_ns: NDArray[np.int64], polarity: NDArray[np.int8], t_end_ns: int) -> list[Reading]:
         """Take the next events; return readings in order of decision.
@@ -141,7 +164,7 @@ class ThresholdDemodulator(GivenRate):
         readings: list[Reading] = []
         for _, group in groupby(spans, key=lambda span: (span.decided_ns, span.by_edge)):
             together = {span.trial: span for span in group}
-            leading = together.pop(self._leader, None)
+            leading = together.pop(self._leader, None)  # None for nobody
             if leading is not None:
                 readings.append(self._take(leading))
             for span in together.values():
@@ -163,10 +186,13 @@ class ThresholdDemodulator(GivenRate):
 
     def _deserves_lead(self, trial: int) -> bool:
         recent = self._recent[trial]
-        if len(recent) < LEAD_CHARACTERS:
+        needed = REGAINED_CHARACTERS if self._leader == NOBODY else LEAD_CHARACTERS
+        if len(recent) < needed:
             return False
-        last = [recent[i] for i in range(-LEAD_CHARACTERS, 0)]
+        last = [recent[i] for i in range(-needed, 0)]
         if any(reading.character.status != Status.OK for reading in last):
             return False
+        if self._leader == NOBODY:
+            return True
         start_ns, stop_ns = last[0].span.start_ns, last[-1].span.stop_ns
         return 2 * explained_ns(self._recent[self._leader], start_ns, stop_ns) < stop_ns - start_ns
