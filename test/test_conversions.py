@@ -155,6 +155,7 @@ CASES = [
     (Cause.INCOMPATIBLE_QOS, {'messages': 0, 'incompatible': 'driver publishes best_effort'}, 'best_effort'),
     (Cause.NO_MESSAGES, {'messages': 0}, 'no messages come'),
     (Cause.UNREADABLE, {'bad_messages': 100, 'events': 0, 'problems': 'encoding (100)'}, r'encoding \(100\)'),
+    (Cause.OVERLOADED, {'shed': 40, 'tracks': (beacon(),)}, 'overloaded: 40 of 100 messages on /events shed'),
     (Cause.NO_EVENTS, {'events': 0}, 'hold no events'),
     (Cause.BELOW_THRESHOLD, {'index_threshold': 1.5}, 'index_threshold = 1.5'),
     (
@@ -178,7 +179,7 @@ def test_a_confirmed_beacon_is_no_silence() -> None:
 
 
 def test_an_empty_scene_is_no_fault() -> None:
-    assert [cause.is_fault for cause in Cause] == [True] * 6 + [False] * 3
+    assert [cause.is_fault for cause in Cause] == [True] * 7 + [False] * 3
 
 
 def test_a_throttled_log_says_how_often_it_kept_quiet() -> None:

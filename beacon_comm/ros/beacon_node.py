@@ -34,9 +34,10 @@ from beacon_comm.ros import conversions
 from beacon_comm.ros.camera import camera_of_message, load_camera
 from beacon_comm.ros.diagnostics import diagnostics_message
 from beacon_comm.ros.live import LiveReceiver, Step
+from beacon_comm.ros.overload import Shedder
 from beacon_comm.ros.parameters import read_parameters, unknown_parameters
 from beacon_comm.ros.report import Report
-from beacon_comm.ros.silence import Silence, Situation, why_silent
+from beacon_comm.ros.silence import Cause, Silence, Situation, why_silent
 from beacon_comm.ros.text import Texts
 from beacon_comm.ros.throttled_log import ThrottledLog
 from beacon_comm.ros.topic import Publishers, choose_type, find_publishers, is_supported, similar_topics, subscribe_raw
@@ -97,6 +98,7 @@ class BeaconNode(Node):
         self._warm_up()
         silent_after_ns = round(self._own.silent_clock_after_s * NS_PER_S)
         self._live = LiveReceiver(self._core, silent_after_ns, round(self._own.silent_clock_lag_s * NS_PER_S), camera)
+        self._shedder = Shedder(round(self._own.max_lag_s * NS_PER_S))
         self._texts = Texts(self._own.text_codes)
         self._lost: list[BeaconSnapshot] = []
         self._topic = self.resolve_topic_name('events')
@@ -149,12 +151,21 @@ class BeaconNode(Node):
 
     @guarded
     def _on_message(self, cdr: bytes, info: dict[str, int]) -> None:
-        waited_s = (time.time_ns() - info['received_timestamp']) / NS_PER_S
+        # A middleware that does not stamp arrivals gives 0: then nothing is known to have waited.
+        arrival_ns = info['received_timestamp'] or time.time_ns()
+        waited_ns = time.time_ns() - arrival_ns
+        if self._shedder.sheds(waited_ns):
+            self._live.shed(self._now_ns())
+            self.report.shed()
+            return
         step = self._live.push(cdr, self._now_ns())
-        self.report.message(step, waited_s)
+        self.report.message(step, waited_ns / NS_PER_S)
+        if step.lost_packets:
+            self.log_warning('lost', f'{self._topic}: {step.lost_packets} packets lost', time.monotonic_ns())
         if step.problem is not None:
             self.log_warning(step.problem_kind, f'{self._topic}: {step.problem}', time.monotonic_ns())
         self._publish(step)
+        self.report.published((time.time_ns() - arrival_ns) / NS_PER_S)
 
     @guarded
     def _on_tick(self) -> None:
@@ -246,6 +257,7 @@ class BeaconNode(Node):
     @guarded
     def _on_message_lost(self, status: Any) -> None:
         self.report.totals['queue_overflow'] += status.total_count_change
+        self._live.messages_lost()
 
     # --- report ---
 
@@ -267,12 +279,15 @@ class BeaconNode(Node):
             messages=traffic.messages,
             events=events,
             bad_messages=traffic.bad_messages,
+            shed=traffic.shed,
             problems=traffic.problem_text(),
             tracks=self._live.beacons(),
             index_threshold=self._core.index_threshold,
         )
         silence = why_silent(situation)
-        if silence is not None and self._silence is not None and silence.cause is self._silence.cause:
+        if silence is not None and silence.cause is Cause.OVERLOADED:
+            self.log_warning('overload', silence.text, time.monotonic_ns())
+        elif silence is not None and self._silence is not None and silence.cause is self._silence.cause:
             log = self._log_silence if silence.cause.is_fault else self._log_quiet
             log(silence.cause.name, silence.text, time.monotonic_ns())
         self._silence = silence

@@ -36,6 +36,7 @@ class Step:
         confirmed_changed: the set of confirmed beacons is another one than before.
         problem: why the message was not read, None if it was.
         problem_kind: the kind it was counted under, '' if none.
+        lost_packets: messages missing before this one.
     """
 
     at: Instant
@@ -44,6 +45,7 @@ class Step:
     confirmed_changed: bool = False
     problem: str | None = None
     problem_kind: str = ''
+    lost_packets: int = 0
 
 
 class LiveReceiver:
@@ -115,7 +117,18 @@ class LiveReceiver:
             receiver = self._follow(decoded)
             self._tie(decoded, decoded.batch, now_ns)
             self._gather(receiver.push(self._time.admit(decoded.batch, now_ns)))
-        return self._step(now_ns, decoded.problem, decoded.problem_kind or '')
+        return self._step(now_ns, decoded)
+
+    def shed(self, now_ns: int) -> None:
+        """Pass a message over unread: there was no time for it.  What was in it is missing, not silent."""
+        if self._stream is not None:
+            self._stream.shed()
+        self._time.hear(now_ns)
+
+    def messages_lost(self) -> None:
+        """Hear from the middleware that messages were lost."""
+        if self._stream is not None:
+            self._stream.lost()
 
     def tick(self, now_ns: int, period_ns: int) -> Step | None:
         """Carry the time of a silent topic on; to be called every ``period_ns``."""
@@ -211,7 +224,11 @@ class LiveReceiver:
         self._lost += output.lost
         self._confirmed_changed |= output.confirmed_changed
 
-    def _step(self, now_ns: int, problem: str | None = None, problem_kind: str = '') -> Step:
+    def _step(self, now_ns: int, decoded: Decoded | None = None) -> Step:
         characters, lost, changed = tuple(self._gathered), tuple(self._lost), self._confirmed_changed
         self._gathered, self._lost, self._confirmed_changed = [], [], False
-        return Step(self.now(now_ns), characters, lost, changed, problem, problem_kind)
+        now = self.now(now_ns)
+        if decoded is None:
+            return Step(now, characters, lost, changed)
+        kind = decoded.problem_kind or ''
+        return Step(now, characters, lost, changed, decoded.problem, kind, decoded.lost_packets)

@@ -18,7 +18,9 @@ class Traffic:
         bad_messages: of these, those that could not be read.
         characters: decoded characters.
         problems: what was wrong, by kind.
-        longest_wait_s: longest time (s) that a message waited in the node's queue.
+        longest_wait_s: longest time (s) that a message waited in the node's queue; of those that were read.
+        longest_lag_s: longest time (s) from a message's arrival to what it gave being published.
+        shed: messages that were shed.
     """
 
     messages: int = 0
@@ -26,6 +28,8 @@ class Traffic:
     characters: int = 0
     problems: Counter[str] = field(default_factory=Counter)
     longest_wait_s: float = 0.0
+    longest_lag_s: float = 0.0
+    shed: int = 0
 
     @property
     def only_refused(self) -> bool:
@@ -47,12 +51,21 @@ class Report:
         self._looked_ns: int | None = None
 
     def message(self, step: Step, waited_s: float) -> None:
-        """Count one message."""
+        """Count one message that was handed on, good or bad."""
         self.traffic.messages += 1
         self.traffic.longest_wait_s = max(self.traffic.longest_wait_s, waited_s)
         if step.problem is not None:
             self.traffic.bad_messages += 1
             self.traffic.problems[step.problem_kind] += 1
+
+    def published(self, lag_s: float) -> None:
+        """Take notice of how long after a message's arrival (s) what it gave was out."""
+        self.traffic.longest_lag_s = max(self.traffic.longest_lag_s, lag_s)
+
+    def shed(self) -> None:
+        """Count one message that was shed."""
+        self.traffic.messages += 1
+        self.traffic.shed += 1
 
     def characters(self, count: int) -> None:
         """Count characters that were published."""
@@ -73,6 +86,7 @@ class Report:
             'events_per_s': f'{events / seconds:.0f}' if seconds > 0.0 else 'nan',
             'characters_per_s': f'{traffic.characters / seconds:.1f}' if seconds > 0.0 else 'nan',
             'queue_lag_s': f'{traffic.longest_wait_s:.4f}',
+            'lag_s': f'{traffic.longest_lag_s:.4f}',
             'tracks': len(tracks),
             **{f'tracks_{state}': count for state, count in sorted(states.items())},
             'slots_full': live.slots_full,

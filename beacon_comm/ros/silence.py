@@ -2,7 +2,7 @@
 
 ::
 
-    publisher? ─ type? ─ package? ─ QoS? ─ messages? ─ readable? ─ events? ─ above the index threshold? ─ confirmed?
+    time? ─ publisher? ─ type? ─ package? ─ QoS? ─ messages? ─ readable? ─ events? ─ above the index threshold? ─ confirmed?
 """
 
 from __future__ import annotations
@@ -18,15 +18,16 @@ from beacon_comm.core.receiver import BeaconSnapshot
 class Cause(IntEnum):
     """Which link it is, in order of the chain."""
 
-    NO_PUBLISHER = 0
-    WRONG_TYPE = 1
-    NOT_INSTALLED = 2
-    INCOMPATIBLE_QOS = 3
-    NO_MESSAGES = 4
-    UNREADABLE = 5
-    NO_EVENTS = 6
-    BELOW_THRESHOLD = 7
-    UNCONFIRMED = 8
+    OVERLOADED = 0
+    NO_PUBLISHER = 1
+    WRONG_TYPE = 2
+    NOT_INSTALLED = 3
+    INCOMPATIBLE_QOS = 4
+    NO_MESSAGES = 5
+    UNREADABLE = 6
+    NO_EVENTS = 7
+    BELOW_THRESHOLD = 8
+    UNCONFIRMED = 9
 
     @property
     def is_fault(self) -> bool:
@@ -53,7 +54,7 @@ class Situation:
         not_installed: the type whose Python package is missing, '' if none is.
         incompatible: what the publisher's QoS lacks, '' if nothing.
         similar: other topics that carry events, with their types.
-        messages, events, bad_messages: counted since the last look.
+        messages, events, bad_messages, shed: counted since the last look.
         problems: kinds of bad messages and how often.
         tracks: all tracks now.
         index_threshold: of the parameters.
@@ -68,13 +69,19 @@ class Situation:
     messages: int = 0
     events: int = 0
     bad_messages: int = 0
+    shed: int = 0
     problems: str = ''
     tracks: Sequence[BeaconSnapshot] = ()
     index_threshold: float = 0.0
 
 
 def why_silent(now: Situation) -> Silence | None:
-    """Return the first link that does not hold, None while a beacon is confirmed."""
+    """Return the first link that does not hold, None while a beacon is confirmed and there is time to read everything."""
+    if now.shed:
+        return Silence(
+            Cause.OVERLOADED,
+            f'overloaded: {now.shed} of {now.messages} messages on {now.topic} shed in the last second',
+        )
     if any(track.state == BeaconState.CONFIRMED for track in now.tracks):
         return None
     return _why_no_events(now) or _why_no_beacon(now)

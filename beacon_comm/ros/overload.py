@@ -1,0 +1,40 @@
+"""Overload: which messages to pass over so that the node stays near the present.
+
+A message's *wait* is what it has spent in the node's queue: from its arrival, as the middleware stamped it, to its turn,
+both on the host's clock.  Neither the publisher's clock nor ``use_sim_time`` is in it, so a bag that is replayed at ten
+times its speed is ten times the load and nothing else.
+
+::
+
+    wait  max_lag ├ ─ ─ ─ ─ ╱│─ ─ ─ ─ ─ ─ ╱│─ ─
+                  │       ╱  │          ╱  │            read, and the queue grows
+                  │     ╱    │        ╱    │            shed, in no time
+         RESUMED  ├ ─ ╱─ ─ ─ └ ─ ─ ─╱─ ─ ─ └ ─
+                  └──────────────────────────────► time
+
+Whole messages are shed, and many in a row: a character needs an unbroken stretch, and every gap costs the two that it
+cuts.  So the longest stretches that the bound allows are read, with the shortest gaps that make up for them.
+"""
+
+from __future__ import annotations
+
+RESUMED = 0.1
+"""Share of the longest wait at which messages are read again."""
+
+
+class Shedder:
+    """Says of each message, in order, whether it is to be shed.
+
+    Args:
+        max_lag_ns: longest wait (ns) of a message that is read.
+    """
+
+    def __init__(self, max_lag_ns: int) -> None:
+        self._max_lag_ns = max_lag_ns
+        self.shedding = False
+
+    def sheds(self, waited_ns: int) -> bool:
+        """Tell whether to shed a message that has waited so long (ns)."""
+        limit_ns = RESUMED * self._max_lag_ns if self.shedding else self._max_lag_ns
+        self.shedding = waited_ns > limit_ns
+        return self.shedding

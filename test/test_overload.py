@@ -1,0 +1,95 @@
+"""Overload: what is shed, how far behind the node may fall, and that what was shed is erased and not invented."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import pytest
+from live_session import MS, PACKET_NS, START_NS, TEXT, Heard, Session, beacon_events, packets, spared
+
+from beacon_comm.ros.overload import Shedder
+from beacon_comm.ros.report import Report
+
+MAX_LAG_NS = 50 * MS
+
+
+def test_it_sheds_from_the_longest_wait_on_until_nearly_nothing_waits() -> None:
+    shedder = Shedder(MAX_LAG_NS)
+    waits_ms = [0, 49, 50, 51, 30, 6, 5, 30, 50, 51, 4, 50]
+    assert [shedder.sheds(wait * MS) for wait in waits_ms] == [
+        False, False, False, True, True, True, False, False, False, True, False, False
+    ]  # fmt: skip
+    assert not shedder.sheds(-5 * MS), 'the host clock was set back'
+
+
+class Queue:
+    """The node's queue and its one thread: a packet every ``PACKET_NS``, reading one takes a given time."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._shedder = Shedder(MAX_LAG_NS)
+        self._waiting: deque[tuple[int, int, bytes]] = deque()
+        self._arrival_ns = self._free_ns = session.now_ns
+        self._count = 0
+        self.shed: list[int] = []
+        self.waits_ns: list[int] = []
+
+    def send(self, stream: list[bytes], reading_ns: int) -> None:
+        """Let packets arrive, each of which takes so long to read."""
+        for message in stream:
+            self._arrival_ns += PACKET_NS
+            self._waiting.append((self._arrival_ns, self._count, message))
+            self._count += 1
+            while self._waiting and max(self._free_ns, self._waiting[0][0]) <= self._arrival_ns:
+                self._take(reading_ns)
+
+    def _take(self, reading_ns: int) -> None:
+        arrival_ns, number, message = self._waiting.popleft()
+        now_ns = max(self._free_ns, arrival_ns)
+        self._session.now_ns = now_ns
+        if self._shedder.sheds(now_ns - arrival_ns):
+            self.shed.append(number)
+            self._session.live.shed(now_ns)
+            self._free_ns = now_ns + MS // 20
+            return
+        self.waits_ns.append(now_ns - arrival_ns)
+        self._session.steps.append(self._session.live.push(message, now_ns))
+        self._free_ns = now_ns + reading_ns
+
+
+@pytest.mark.parametrize('receiver', ['threshold'])
+def test_twice_the_load_is_shed_erased_and_survived(receiver: str) -> None:
+    text = 8 * TEXT
+    stream = packets(beacon_events(text))
+    session = Session(receiver=receiver)
+    queue = Queue(session)
+    third = len(stream) // 3
+    queue.send(stream[:third], PACKET_NS // 2)
+    assert not queue.shed
+    queue.send(stream[third : 2 * third], 2 * PACKET_NS)
+    assert len(queue.shed) == pytest.approx(third / 2, rel=0.1)
+    shed = len(queue.shed)
+    queue.send(stream[2 * third :], PACKET_NS // 2)
+    assert len(queue.shed) - shed < 20, 'only what had waited too long already'
+    session.wait(0.2)
+
+    assert max(queue.waits_ns) <= MAX_LAG_NS
+    counts = session.live.counts
+    assert counts['shed_packets'] == len(queue.shed) and counts['lost_packets'] == counts['restarts'] == 0
+    assert counts['packets'] == len(stream)
+    heard = Heard(session.characters(), text)
+    assert heard.wrong_ok == []
+    gaps = [(START_NS + k * PACKET_NS, START_NS + (k + 1) * PACKET_NS) for k in queue.shed]
+    assert spared(gaps, len(text)) <= heard.right
+    assert len(session.track_ids()) == 1
+
+
+def test_the_report_tells_of_what_was_shed() -> None:
+    session = Session()
+    report = Report()
+    session.live.shed(session.now_ns)
+    report.shed()
+    report.published(0.012)
+    traffic, events, values = report.look(session.live, 0)
+    assert (traffic.messages, traffic.shed, events) == (1, 1, 0)
+    assert values['shed_packets'] == 1 and values['lag_s'] == '0.0120'
