@@ -42,7 +42,11 @@ def beacon_events(text: str = TEXT, start_ns: int = START_NS, bit_rate: float = 
 
 
 def packets(
-    events: EventBatch, size: tuple[int, int] = (64, 48), offset_ns: int = STAMP_NS - START_NS, frame_id: str = 'cam'
+    events: EventBatch,
+    size: tuple[int, int] = (64, 48),
+    offset_ns: int = STAMP_NS - START_NS,
+    frame_id: str = 'cam',
+    first_seq: int = 0,
 ) -> list[bytes]:
     """Cut events into packets that hold all time; a stamp is its packet's first event's plus ``offset_ns``, or 0 below."""
     encoder = Evt3Encoder(*size)
@@ -55,7 +59,7 @@ def packets(
         part = events.slice(start, stop, int(borders_ns[k + 1]))
         begin_ns = int(part.t_ns[0] if len(part) else borders_ns[k])
         stamp_ns = max(0, begin_ns + offset_ns)
-        made.append(build_event_packet(stamp_ns, frame_id, *size, k, 0, 'evt3', encoder.encode(part)))
+        made.append(build_event_packet(stamp_ns, frame_id, *size, first_seq + k, 0, 'evt3', encoder.encode(part)))
     return made
 
 

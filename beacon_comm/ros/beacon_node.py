@@ -165,7 +165,9 @@ class BeaconNode(Node):
         if step.problem is not None:
             self.log_warning(step.problem_kind, f'{self._topic}: {step.problem}', time.monotonic_ns())
         self._publish(step)
-        self.report.published((time.time_ns() - arrival_ns) / NS_PER_S)
+        lag_ns = time.time_ns() - arrival_ns
+        self._shedder.read(lag_ns - waited_ns)
+        self.report.published(lag_ns / NS_PER_S)
 
     @guarded
     def _on_tick(self) -> None:
