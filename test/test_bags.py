@@ -1,9 +1,13 @@
 """Reading and writing bags: every form of bag gives the same raw CDR, and damage is named."""
 
+import bz2
 import shutil
+import sqlite3
 import struct
+from contextlib import closing
 from pathlib import Path
 
+import lz4.frame
 import numpy as np
 import pytest
 from rosbags import rosbag1, rosbag2
@@ -11,6 +15,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from beacon_comm.core.errors import RecordingError
+from beacon_comm.recordings import compression
 from beacon_comm.recordings.bag_writer import BagWriter
 from beacon_comm.recordings.bags import TopicInfo, open_recording
 from beacon_comm.recordings.interfaces import PACKET_TYPE, definition_text, definitions
@@ -151,6 +156,123 @@ def test_damage_within_a_file_keeps_what_is_before(tmp_path: Path, plugin: rosba
             kept.extend(bag.messages(TOPIC))
     assert 6 <= len(kept) < 20
     assert kept[:6] == MESSAGES[:6]
+
+
+def partly(path: Path) -> tuple[list[tuple[int, bytes]], str]:
+    """Return what a damaged bag gives, and how it complains at the end."""
+    kept: list[tuple[int, bytes]] = []
+    with open_recording(path) as bag, pytest.raises(RecordingError) as refusal:
+        kept.extend(bag.messages(bag.event_topic()))
+    return kept, str(refusal.value)
+
+
+@pytest.mark.parametrize(('share', 'left'), [(0.6, 5), (0.9, 16)])
+def test_a_cut_db3_gives_what_is_left_and_says_so(tmp_path: Path, share: float, left: int) -> None:
+    folder = write_bag(tmp_path / 'bag', rosbag2.StoragePlugin.SQLITE3)
+    file = folder / 'bag.db3'
+    content = file.read_bytes()
+    file.write_bytes(content[: int(len(content) * share)])
+    kept, complaint = partly(file)
+    assert set(kept) < set(MESSAGES) and len(kept) >= left
+    assert 'bag.db3: ' in complaint and 'malformed' in complaint
+
+
+def test_a_bad_page_of_a_db3_is_stepped_over(tmp_path: Path) -> None:
+    folder = write_bag(tmp_path / 'bag', rosbag2.StoragePlugin.SQLITE3)
+    file = folder / 'bag.db3'
+    content = bytearray(file.read_bytes())
+    at = content.find(MESSAGES[9][1]) // 4096 * 4096
+    content[at : at + 4096] = b'\xff' * 4096
+    file.write_bytes(content)
+    kept, complaint = partly(file)
+    assert [message for message in kept if message not in MESSAGES] == []
+    assert len(kept) == len(set(kept)) >= 14 and kept[0] == MESSAGES[0] and kept[-1] == MESSAGES[-1]
+    assert 'malformed' in complaint
+
+
+def test_what_is_no_message_in_a_db3_is_stepped_over(tmp_path: Path) -> None:
+    folder = write_bag(tmp_path / 'bag', rosbag2.StoragePlugin.SQLITE3)
+    with closing(sqlite3.connect(folder / 'bag.db3')) as database:
+        database.execute("UPDATE messages SET data = 'text' WHERE id = 4")
+        database.execute("UPDATE messages SET timestamp = 'soon' WHERE id = 9")
+        database.execute("INSERT INTO topics SELECT 7, x'00', 5, serialization_format, '', '' FROM topics LIMIT 1")
+        database.commit()
+    kept, complaint = partly(folder)
+    assert sorted(kept) == [message for k, message in enumerate(MESSAGES) if k not in (3, 8)]
+    assert 'str' in complaint
+
+
+def ros1_packet(k: int) -> bytes:
+    raw = struct.pack('<IIII', k, 5, k, 0) + struct.pack('<II', 480, 640) + struct.pack('<QQ', k, 2)
+    return raw + struct.pack('<I', 4) + b'evt3' + b'\x00' + struct.pack('<I', 900) + bytes([k]) * 900
+
+
+def ros1_bag(path: Path, packing: rosbag1.Writer.CompressionFormat | None = None) -> list[tuple[int, bytes]]:
+    """Write 20 messages in chunks of four or so; return what is to be read."""
+    writer = rosbag1.Writer(path)
+    writer.chunk_threshold = 3000
+    if packing is not None:
+        writer.set_compression(packing)
+    with writer:
+        connection = writer.add_connection(
+            TOPIC, PACKET_TYPE, msgdef=definition_text(PACKET_TYPE), md5sum='0123456789abcdef0123456789abcdef'
+        )
+        for k in range(20):
+            writer.write(connection, 3_000_000_007 + k, ros1_packet(k))
+    return [(3_000_000_007 + k, event_message_to_cdr(ros1_packet(k), PACKET_TYPE)) for k in range(20)]
+
+
+@pytest.mark.parametrize('packing', [None, *rosbag1.Writer.CompressionFormat])
+def test_a_ros1_bag_without_its_index(tmp_path: Path, packing: rosbag1.Writer.CompressionFormat | None) -> None:
+    """As a recorder that was killed leaves it: the head says that there is no index, and the last chunk is cut."""
+    file = tmp_path / 'killed.bag'
+    messages = ros1_bag(file, packing)
+    assert read(file) == messages
+    content = bytearray(file.read_bytes())
+    at = content.find(b'index_pos=') + len(b'index_pos=')
+    content[at : at + 8] = bytes(8)
+    last = content.rfind(b'compression=')
+    file.write_bytes(content[: last + 60])
+    kept, complaint = partly(file)
+    assert 14 <= len(kept) < 20 and kept == messages[: len(kept)]
+    assert 'killed.bag: ' in complaint
+
+
+def test_a_bad_chunk_of_a_ros1_bag_is_stepped_over(tmp_path: Path) -> None:
+    file = tmp_path / 'one.bag'
+    messages = ros1_bag(file, rosbag1.Writer.CompressionFormat.LZ4)
+    content = bytearray(file.read_bytes())
+    second = content.find(b'compression=', content.find(b'compression=') + 1)
+    content[second + 60 : second + 100] = b'\xff' * 40
+    file.write_bytes(content)
+    kept, complaint = partly(file)
+    assert 12 <= len(kept) < 20 and set(kept) < set(messages) and kept[-1] == messages[-1]
+    assert 'cannot be decompressed' in complaint or 'record' in complaint
+
+
+def test_a_compressed_message_that_cannot_be_unpacked_is_stepped_over(tmp_path: Path) -> None:
+    folder = write_bag(tmp_path / 'bag', rosbag2.StoragePlugin.SQLITE3, rosbag2.CompressionMode.MESSAGE)
+    with closing(sqlite3.connect(folder / 'bag.db3')) as database:
+        database.execute('UPDATE messages SET data = substr(data, 1, 9) WHERE id = 5')
+        database.commit()
+    kept, complaint = partly(folder)
+    assert kept == MESSAGES[:4] + MESSAGES[5:]
+    assert 'zstd' in complaint
+
+
+def test_no_more_is_unpacked_than_a_bag_can_hold(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compression, 'MOST_BYTES', 1000)
+    for name, packed in (
+        ('zstd', compression.zstd.compress(bytes(2000))), ('lz4', lz4.frame.compress(bytes(2000))),
+        ('bz2', bz2.compress(bytes(2000))),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=f'by {name} is too large'):
+            compression.decompress(name, packed)
+    two = compression.zstd.compress(b'one') + compression.zstd.compress(b'two')
+    assert compression.decompress('zstd', two) == b'onetwo'
+    with pytest.raises(ValueError, match='ends before its end'):
+        compression.decompress('zstd', two[:-4])
+    assert compression.decompress('none', b'as it is') == b'as it is'
 
 
 def test_a_destroyed_head_is_refused(tmp_path: Path) -> None:

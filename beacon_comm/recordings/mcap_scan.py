@@ -10,19 +10,13 @@ Schemas are taken for their name only, never parsed.  Source: mcap.dev/spec.
 from __future__ import annotations
 
 import struct
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 from zlib import crc32
 
-from lz4.frame import decompress as lz4_decompress  # type: ignore[import-untyped]
-
-if sys.version_info >= (3, 14):
-    from compression import zstd
-else:
-    from backports import zstd
+from beacon_comm.recordings.compression import decompress
 
 MAGIC = b'\x89MCAP0\r\n'
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 3, 4, 5, 6, 15
@@ -109,11 +103,7 @@ def _decompressed(content: bytes) -> bytes:
     records = content[at + 8 :]
     if compression not in ('', 'zstd', 'lz4'):
         raise ValueError(f'chunk compression {compression!r} is not known')
-    try:
-        if compression:
-            records = (zstd.decompress if compression == 'zstd' else lz4_decompress)(records)
-    except (zstd.ZstdError, RuntimeError) as error:
-        raise ValueError(f'a chunk cannot be decompressed ({error})') from error
+    records = decompress(compression, records)
     if len(records) != size or (checksum and crc32(records) != checksum):
         raise ValueError('a chunk fails its checksum')
     return records
