@@ -227,3 +227,17 @@ def test_a_line_that_is_held_says_nothing() -> None:
     polarity = np.where(t_ns < 10 * NS_PER_S, 1, -1).astype(np.int8)
     outputs = [receiver.push_signal(t_ns, polarity, 20 * NS_PER_S), receiver.flush()]
     assert received(outputs) == []
+
+
+def test_a_time_far_ahead_costs_nothing() -> None:
+    """A damaged message may hold events of any time; hop by hop the way there would take for ever."""
+    text = on_disc(simulate_text(TEXT, 3125.0, t0_ns=NS_PER_S, model=STEADY), still(80, 60))
+    far_ns = 1 << 61
+    ahead = EventBatch(
+        np.array([5, 6], np.uint16), np.array([5, 6], np.uint16), np.ones(2, np.int8), np.array([far_ns, 2 * far_ns - 1]),
+        2 * far_ns - 1,
+    )  # fmt: skip
+    receiver = Receiver(Parameters(bit_rates=(3125.0,)), SIZE)
+    outputs = [receiver.push(merged(text, ahead))]
+    assert ''.join(chr(code) for _, _, code, _ in sorted(received(outputs), key=lambda c: c[1])).endswith(TEXT)
+    assert receiver.t_ns == 2 * far_ns - 1 and receiver.beacons() == ()

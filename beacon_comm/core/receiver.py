@@ -198,8 +198,9 @@ class Receiver:
             self._t_ns = int(batch.t_ns[0]) if len(batch) else batch.t_end_ns
         start = 0
         while (t_hop := (self._t_ns // hop + 1) * hop) <= batch.t_end_ns:
-            if start == len(batch) and self._detection.idle:
-                t_hop = batch.t_end_ns // hop * hop  # nothing can change at the points between
+            if self._detection.idle:  # nothing can change at the points before the next event
+                next_ns = int(batch.t_ns[start]) if start < len(batch) else batch.t_end_ns
+                t_hop = max(t_hop, next_ns // hop * hop)
             stop = int(np.searchsorted(batch.t_ns, t_hop, side='left'))
             self._t_ns = t_hop
             yield batch.slice(start, stop, t_hop), True
