@@ -67,3 +67,34 @@ def test_wrong_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / 'cut.mat').write_bytes(whole.read_bytes()[:5000])
     with pytest.raises(RecordingError, match='not a readable MATLAB file'):
         read_mat(tmp_path / 'cut.mat')
+
+
+@pytest.mark.parametrize('compressed', [False, True])
+def test_other_variables_beside_them_do_not_matter(tmp_path: Path, compressed: bool) -> None:
+    path = tmp_path / 'more.mat'
+    wanted = {'event': np.array([[1, -1]], np.int8), 'event_t': np.array([[0.5, 1.5]])}
+    others = {'text': 'abc', 'cell': np.array(['a', 2], object), 'complex': 1j * np.ones(2), 'struct': {'a': 1}}
+    savemat(path, {**others, **wanted}, do_compression=compressed)
+    t_ns, polarity = read_mat(path)
+    assert (t_ns.tolist(), polarity.tolist()) == ([500_000_000, 1_500_000_000], [1, -1])
+
+
+def test_version_4_is_read(tmp_path: Path) -> None:
+    savemat(tmp_path / 'old.mat', {'event': np.array([[1, -1]]), 'event_t': np.array([[0.5, 1.5]])}, format='4')
+    assert read_mat(tmp_path / 'old.mat')[0].tolist() == [500_000_000, 1_500_000_000]
+
+
+@pytest.mark.parametrize('compressed', [False, True])
+def test_damage_anywhere_is_refused_or_harmless(tmp_path: Path, compressed: bool) -> None:
+    """Every byte of a small file, in turn, is another one; scipy's reader ends the process on some of these."""
+    path = tmp_path / 'small.mat'
+    savemat(path, {'event': np.ones((1, 3), np.int8), 'event_t': np.arange(3.0)[None]}, do_compression=compressed)
+    sound = path.read_bytes()
+    for at in range(124, len(sound)):
+        for value in (0, 0x10, 0xFF):
+            path.write_bytes(sound[:at] + bytes([value]) + sound[at + 1 :])
+            try:
+                t_ns, polarity = read_mat(path)
+            except RecordingError:
+                continue
+            assert len(t_ns) == len(polarity) > 0

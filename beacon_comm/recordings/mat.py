@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beacon_comm.core.errors import RecordingError
+from beacon_comm.recordings.mat5 import is_mat5, variables
 
 # Beyond this a double no longer holds whole microseconds with room to round: some 34 years.
 MAX_TIME_S = 2.0**30
@@ -58,18 +59,24 @@ def read_mat(path: str | Path) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
 
 
 def _load(path: Path) -> dict[str, object]:
-    from scipy.io import loadmat  # slow to import, and most commands read no .mat
-
     if not path.is_file():
         raise RecordingError(f'{path}: no such file')
+    content = path.read_bytes()
+    if is_mat5(content):
+        try:
+            return dict(variables(content))
+        except ValueError as error:
+            raise RecordingError(f'{path}: not a readable MATLAB file ({error})') from error
+    if content[124:128] in (b'\x00\x02IM', b'\x02\x00MI'):
+        raise RecordingError(f"{path}: a MATLAB 7.3 (HDF5) file; save it with save(…, '-v7') to read it here")
+    if 0 not in content[:4]:
+        raise RecordingError(f'{path}: not a readable MATLAB file (its head is of no known version)')
+    from scipy.io import loadmat  # for version 4; slow to import, and hardly a file is that old
+
     try:
         loaded = loadmat(path, variable_names=['event', 'event_t'])
         if not {'event', 'event_t'} <= loaded.keys():
             loaded = loadmat(path)
-    except NotImplementedError as error:
-        raise RecordingError(
-            f"{path}: a MATLAB 7.3 (HDF5) file; save it with save(…, '-v7') to read it here"
-        ) from error
     except Exception as error:  # scipy raises whatever its parsing stumbles over
         raise RecordingError(f'{path}: not a readable MATLAB file ({error})') from error
     return {name: value for name, value in loaded.items() if not name.startswith('__')}
