@@ -241,3 +241,16 @@ def test_a_time_far_ahead_costs_nothing() -> None:
     outputs = [receiver.push(merged(text, ahead))]
     assert ''.join(chr(code) for _, _, code, _ in sorted(received(outputs), key=lambda c: c[1])).endswith(TEXT)
     assert receiver.t_ns == 2 * far_ns - 1 and receiver.beacons() == ()
+
+
+def test_a_beacon_among_more_lamps_than_tracks_has_its_turn() -> None:
+    lamps = [on_disc(square_wave(120.0, 0.5, 2.2, seed=k), still(20 + 30 * (k % 5), 20 + 40 * (k // 5)), k) for k in range(7)]
+    beacon = on_disc(simulate_text(TEXT * 9, 3125.0, t0_ns=500_000_000, model=STEADY, seed=1), still(80, 100))
+    parameters = Parameters(bit_rates=(3125.0,), rate_search='listed', max_tracks=4, candidate_slots=2, starved_after_s=0.2)
+    receiver = Receiver(parameters, SIZE)
+    outputs = [receiver.push(part) for part in pieces(merged(*lamps, beacon), list(range(0, 2_000_000, 50_000)))]
+    assert TEXT in text_of(outputs)
+    (confirmed,) = [one for one in receiver.beacons() if one.state is BeaconState.CONFIRMED]
+    assert (confirmed.x_px, confirmed.y_px) == pytest.approx((80.0, 100.0), abs=2.0)
+    lost = [one.track_id for output in outputs for one in output.lost]
+    assert len(lost) == len(set(lost)) > 0 and len(receiver.beacons()) <= 4

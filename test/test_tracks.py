@@ -215,3 +215,58 @@ def test_a_better_observation_moves_a_track_more():
         track.observe(50.5, 50.0, T0_NS + HOP_NS, variance)
         steps.append(track.x_px - 50.0)
     assert 0.4 < steps[0] < 0.5 and steps[0] > steps[1] > steps[2] > 0
+
+
+def full(places, t_ns=T0_NS, **marks):
+    """A tracker of four tracks, all of them in use."""
+    tracker = Tracker(Parameters(max_tracks=4), SIZE)
+    tracker.update([blob(x, 50, t_ns) for x in places], t_ns)
+    for track in tracker.tracks.values():
+        for name, value in marks.items():
+            setattr(track, name, value)
+    return tracker
+
+
+def test_without_room_those_in_sight_and_those_with_a_demodulator_stay():
+    tracker = full((50, 100, 150, 200))
+    seen = [blob(x, 50, T0_NS + HOP_NS) for x in (50, 100, 150, 200, 300)]
+    changes = tracker.update(seen, T0_NS + HOP_NS)
+    assert (changes.new, changes.lost, changes.waiting) == ((), (), 1)
+    tracker = full((50, 100, 150, 200), held=True)
+    changes = tracker.update([blob(300, 50, T0_NS + HOP_NS)], T0_NS + HOP_NS)  # all others are quiet
+    assert (changes.new, changes.lost, changes.waiting) == ((), (), 1)
+
+
+def test_room_is_made_by_quiet_tracks_and_then_by_those_that_had_a_turn_the_last_one_first():
+    tracker = full((50, 100, 150, 200))
+    first, second, third, fourth = tracker.tracks.values()
+    first.tried_ns, second.tried_ns = T0_NS - 2, T0_NS - 1
+    fourth.held = True
+    ended = []
+    for k in range(1, 6):
+        t_ns = T0_NS + k * HOP_NS
+        in_sight = [50, 100] + [300 + 50 * n for n in range(k)]  # 150 and 200 are quiet from now on
+        changes = tracker.update([blob(x, 50, t_ns) for x in in_sight], t_ns)
+        ended += [track.track_id for track in changes.lost]
+        assert len(tracker.tracks) == 4
+    assert ended == [3, 2, 1] and sorted(tracker.tracks) == [4, 5, 6, 7]
+    assert changes.waiting == 4
+
+
+def test_more_lamps_than_tracks_take_turns_and_a_weak_beacon_too():
+    """Each track is tried for three hops; the strongest lamp must not be back before the weakest blob had its turn."""
+    tracker = Tracker(Parameters(max_tracks=4), SIZE)
+    turns = []
+    for k in range(120):
+        t_ns = T0_NS + k * HOP_NS
+        seen = [blob(50 * n, 50, t_ns, index=9.0 - n) for n in range(1, 7)] + [blob(400, 50, t_ns, index=0.7)]
+        tracker.update(seen, t_ns)
+        if k % 3 == 0:
+            for track in tracker.tracks.values():
+                if track.held:
+                    track.held, track.tried_ns = False, t_ns
+            queue = sorted(tracker.tracks.values(), key=lambda t: (t.tried_ns or 0, -t.index, t.track_id))
+            queue[0].held, queue[0].tried_ns = True, None
+            turns.append(round(queue[0].x_px))
+    assert set(turns[:8]) == {50, 100, 150, 200, 250, 300, 400}
+    assert min(turns.count(x) for x in set(turns)) >= 3

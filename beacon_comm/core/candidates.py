@@ -58,7 +58,7 @@ class BeaconState(IntEnum):
     DEMOTED = 3
     """Parity has failed it, or there were too few characters; at the back of the queue."""
     LOST = 4
-    """Unseen past lost_after_s."""
+    """Unseen past lost_after_s, merged, or ended in favour of others where max_tracks are kept."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,7 +176,8 @@ class CandidateSlots:
         To be called at each point of the hop grid, when every slot has been demodulated up to it.
 
         Args:
-            tracks: the tracks now, by label; those that were lost have been forgotten.
+            tracks: the tracks now, by label; those that were lost have been forgotten.  They are told which of them have a
+                slot, and which have had one.
             t_ns: the hop's time (ns).
             backlog: returns a track's buffered events before ``t_ns``: times (ns, ``(n,)`` int64) and polarities
                 (``(n,)`` int8).  A slot that is given starts from there; of a track that has had one, from the end
@@ -196,6 +197,12 @@ class CandidateSlots:
         received = []
         for track_id in given:
             received += self._give(track_id, t_ns, *backlog(track_id))
+        for track_id, track in tracks.items():
+            track.held = track_id in self._slots
+            if track.held:
+                track.tried_ns = None
+            elif track_id in self._tried:
+                track.tried_ns = self._tried[track_id].ended_ns
         return sorted(received, key=_by_time)
 
     def demodulate(self, routed: Iterable[Routed], t_end_ns: int) -> list[ReceivedCharacter]:
@@ -279,8 +286,9 @@ class CandidateSlots:
 
     def _queue(self, tracks: Mapping[int, Track]) -> list[int]:
         def place(track_id: int) -> tuple[int, float, int]:
-            tried = self._tried.get(track_id)
-            return (0, -tracks[track_id].index, track_id) if tried is None else (1, tried.ended_ns, track_id)
+            track, tried = tracks[track_id], self._tried.get(track_id)
+            ended_ns = track.tried_ns if tried is None else tried.ended_ns
+            return (0, -track.index, track_id) if ended_ns is None else (1, ended_ns, track_id)
 
         return sorted(
             (track_id for track_id, track in tracks.items() if track_id not in self._slots and not track.quiet),

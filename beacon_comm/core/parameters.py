@@ -208,7 +208,9 @@ class Parameters(Declared):
     merge_after_s: float = parameter(
         0.5, 'a track inside the blob of an older one for this long is dropped', 's', 0.0
     )
-    max_tracks: int = parameter(256, 'tracks kept at once; further blobs wait', '', 1, 65_000)
+    max_tracks: int = parameter(
+        256, 'tracks kept at once; for further blobs quiet ones and those that had a turn in vain are given up', '', 1, 65_000
+    )
     routing_extent_factor: float = parameter(1.5, "an event is a track's within its extent times this …", '', 0.1)
     routing_margin_px: float = parameter(2.0, '… plus this', 'px', 0.0)
     buffer_min_s: float = parameter(0.5, 'events kept for each track: the longer of this …', 's', 0.0)

@@ -4,6 +4,12 @@
                                                            ├──► no blob:   quiet, position predicted, then lost
                                                            └──► no track:  a new one, strongest blob first
 
+Where ``max_tracks`` are kept, tracks make room for further blobs: first those that are quiet, the longest unseen first, then
+those that have had a turn in vain, the last one first, since its next turn is farthest away.  A track with a demodulator
+never does, nor one in sight that waits for its first turn.  Where a track was that had its turn, a blob has no first turn
+again: it comes after all others, by the time of that turn, here and in the slots' queue, so that lamps do not take turns among
+themselves.
+
 The filter is a Kalman filter of constant velocity, both axes alike.  An observation is the mean of n events of a
 disc of radius R, so its variance is R² / 4n an axis: a dim blob moves a track little, a bright one at once.
 A prediction goes on at constant velocity for a moment and then fades, so that it stays within bounds:
@@ -33,6 +39,7 @@ _FIRST_SPEED_PX_PER_S = 200.0  # standard deviation of an unknown velocity
 _KNOWN_AFTER_NS = 100_000_000  # a velocity seen for less long is not gone on with
 _FLOOR_PX = 0.05  # an observation is never better than this
 _SURPRISE = 16.0  # an innovation of more than 4 standard deviations is a manoeuvre
+_NEVER = -(1 << 63)
 _EXTENT_RISE, _EXTENT_FALL = 0.5, 0.05  # an extent grows at once and shrinks slowly
 
 
@@ -50,6 +57,9 @@ class Track:
         vx_px_per_s, vy_px_per_s: image velocity (px/s).
         quiet: no blob at the last hop; the position is predicted.
         matched_ns: the last hop (ns) that had a blob of it.
+        held: a demodulator listens to it.
+        tried_ns: when (ns) its last turn at a demodulator ended, or that of the track that made room there; None: there was
+            none, or it has it now.
         covered_since_ns: since when (ns) an older track has had the blob it lies in, None: it lies in none.
         variance: of position (px²), of position and velocity (px²/s), of velocity (px²/s²), one axis.
     """
@@ -66,6 +76,8 @@ class Track:
     vy_px_per_s: float = 0.0
     quiet: bool = False
     matched_ns: int = 0
+    held: bool = False
+    tried_ns: int | None = None
     covered_since_ns: int | None = None
     variance: tuple[float, float, float] = field(default=(1.0, 0.0, _FIRST_SPEED_PX_PER_S**2))
 
@@ -111,7 +123,7 @@ class TrackChanges:
 
     Attributes:
         new: tracks that began.
-        lost: tracks that ended, as they were.
+        lost: tracks that ended, unseen for too long, merged or in favour of others, as they were.
         new_blobs: for each new track, which of the hop's blobs it began with.
         waiting: blobs that got no track because ``max_tracks`` are kept.
     """
@@ -137,6 +149,8 @@ class Tracker:
         self._merge_after_ns = round(parameters.merge_after_s * NS_PER_S)
         self._tracks: dict[int, Track] = {}
         self._next_id = 1
+        # Where tracks made room that had had a turn: x, y, radius (px), and when (ns) that ended.
+        self._tried_places: deque[tuple[float, float, float, int]] = deque(maxlen=parameters.max_tracks)
 
     @property
     def tracks(self) -> Mapping[int, Track]:
@@ -160,12 +174,16 @@ class Tracker:
         lost = tuple(track for track in tracks if self._ended(track, t_hop_ns))
         for track in lost:
             del self._tracks[track.track_id]
-        new, new_blobs, waiting = self._begin(tracks, blobs, blob_of, track_of, t_hop_ns)
-        return TrackChanges(new, lost, new_blobs, waiting)
+        left = self._unfollowed(tracks, blobs, blob_of, track_of, t_hop_ns)
+        evicted = self._make_room(left)
+        room = max(0, self._parameters.max_tracks - len(self._tracks))
+        new = tuple(self._new_track(blobs[j], t_hop_ns, tried_ns) for tried_ns, j in left[:room])
+        return TrackChanges(new, lost + evicted, tuple(j for _, j in left[:room]), len(left) - len(new))
 
     def clear(self, sensor_size: tuple[int, int]) -> TrackChanges:
         """Lose every track and go on with a sensor size; labels go on."""
         self._sensor_size = sensor_size
+        self._tried_places.clear()
         lost = tuple(self._tracks.values())
         self._tracks.clear()
         return TrackChanges(lost=lost)
@@ -207,31 +225,64 @@ class Tracker:
         since = track.covered_since_ns
         return since is not None and t_hop_ns - since >= self._merge_after_ns
 
-    def _begin(
+    def _unfollowed(
         self,
         tracks: list[Track],
         blobs: Sequence[Blob],
         blob_of: list[int],
         track_of: list[int],
         t_hop_ns: int,
-    ) -> tuple[tuple[Track, ...], tuple[int, ...], int]:
-        """Begin tracks with the blobs that are left, but not with pieces of a blob that is followed already."""
+    ) -> list[tuple[int, int]]:
+        """Return the blobs that are to begin tracks, the first one first, each behind the time (ns) of the turn that was had
+        there, ``_NEVER`` without one; pieces of a followed blob are not among them."""
         left = [j for j in range(len(blobs)) if track_of[j] < 0]
         seen = [tracks[i] for i in range(len(tracks)) if blob_of[i] >= 0]
         if left and seen:
             circle = np.column_stack((positions_at(seen, t_hop_ns), [track.extent_px for track in seen]))
             piece_of = _circle_of(np.array([(blobs[j].x_px, blobs[j].y_px) for j in left]), circle)
             left = [j for j, i in zip(left, piece_of, strict=True) if i < 0]
-        left.sort(key=lambda j: (-blobs[j].index, -blobs[j].event_count, j))
-        room = max(0, self._parameters.max_tracks - len(self._tracks))
-        new = tuple(self._new_track(blobs[j], t_hop_ns) for j in left[:room])
-        return new, tuple(left[:room]), max(0, len(left) - room)
+        tried_ns = self._tried_there(left, blobs)
+        return sorted(
+            zip(tried_ns, left, strict=True), key=lambda entry: (entry[0], -blobs[entry[1]].index, -blobs[entry[1]].event_count)
+        )
 
-    def _new_track(self, blob: Blob, t_hop_ns: int) -> Track:
+    def _tried_there(self, left: list[int], blobs: Sequence[Blob]) -> list[int]:
+        if not left or not self._tried_places:
+            return [_NEVER] * len(left)
+        centres = np.array([(blobs[j].x_px, blobs[j].y_px) for j in left])
+        circles = np.array([place[:3] for place in self._tried_places])
+        return [self._tried_places[k][3] if k >= 0 else _NEVER for k in _circle_of(centres, circles)]
+
+    def _make_room(self, left: list[tuple[int, int]]) -> tuple[Track, ...]:
+        """End tracks in favour of the blobs that are left over; see the module's head."""
+        room = max(0, self._parameters.max_tracks - len(self._tracks))
+        if len(left) <= room:
+            return ()
+        unheld = [track for track in self._tracks.values() if not track.held]
+        quiet = sorted((track for track in unheld if track.quiet), key=lambda track: track.last_seen_ns)
+        tried = sorted(
+            ((track.tried_ns, track) for track in unheld if track.tried_ns is not None and not track.quiet),
+            key=lambda entry: (-entry[0], entry[1].track_id),
+        )
+        ended = []
+        for blob_tried_ns, _ in left[room:]:
+            if quiet:
+                ended.append(quiet.pop(0))
+            elif tried and tried[0][0] > blob_tried_ns:
+                ended.append(tried.pop(0)[1])
+            else:
+                break
+        for track in ended:
+            del self._tracks[track.track_id]
+            if track.tried_ns is not None:
+                self._tried_places.append((track.x_px, track.y_px, max(track.extent_px, 1.0), track.tried_ns))
+        return tuple(ended)
+
+    def _new_track(self, blob: Blob, t_hop_ns: int, tried_ns: int) -> Track:
         variance = (blob.variance_px2 + _FLOOR_PX**2, 0.0, _FIRST_SPEED_PX_PER_S**2)
         track = Track(
             self._next_id, blob.x_px, blob.y_px, blob.t_ns, blob.extent_px, blob.index, blob.t_ns, blob.t_ns,
-            matched_ns=t_hop_ns, variance=variance,
+            matched_ns=t_hop_ns, tried_ns=None if tried_ns == _NEVER else tried_ns, variance=variance,
         )  # fmt: skip
         self._tracks[track.track_id] = track
         self._next_id += 1
