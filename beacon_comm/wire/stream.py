@@ -46,6 +46,8 @@ MAX_SIDE_PX = 1 << 12
 """No event sensor is larger; images of a size that a damaged message names are not to be made."""
 MOST_LATE = 8
 """Packets by which one may come late."""
+MOST_LOST = 1 << 20
+"""Packets that one gap is counted as, at most."""
 LATE_IN_A_ROW = 2
 """So many late packets in a row are late; more are a stream that begins anew."""
 
@@ -250,7 +252,7 @@ class EventStream:
         last, self._last = self._last, packet
         step = 0 if last is None or last.seq is None or packet.seq is None else packet.seq - last.seq
         elapsed_ns = 0 if last is None else packet.stamp_ns - last.stamp_ns
-        lost = max(step - 1 - self._skipped, 0)
+        lost = min(max(step - 1 - self._skipped, 0), MOST_LOST)  # more is a damaged seq
         gap = step > 1 or self._skipped > 0
         self._missing |= gap
         self._skipped = 0
