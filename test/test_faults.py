@@ -20,7 +20,7 @@ SHARE = 0.05
 LOCKED = 60
 """Packets at the beginning that are left whole: what is lost before the lock is another question."""
 SEQUENCE, THRESHOLD = 'sequence', 'threshold'
-RECEIVERS = [THRESHOLD]
+RECEIVERS = [SEQUENCE, THRESHOLD]
 
 
 def simulated(text: str, bit_rate: float, seed: int) -> EventBatch:

@@ -330,6 +330,23 @@ def test_a_gap_says_nothing_wrong_and_is_read_on_after(gap_bits, search):
     assert times == sorted(times) and min(np.diff(times)) > 10_000_000
 
 
+@pytest.mark.parametrize('gap_bits', [2, 5, 10, 23, 60.5, 5000])
+@pytest.mark.parametrize('begin_bits', [1003.3, 1007.0])
+def test_a_gap_it_is_told_of_costs_what_it_overlaps_and_two_more(gap_bits, begin_bits):
+    sent = PROSE * 8
+    t_ns, polarity = beacon_events(text_bits(sent), 1000.0)
+    begin, end = round(begin_bits * 1e6), round((begin_bits + gap_bits) * 1e6)
+    before, after = t_ns < begin, t_ns >= end
+    receiver = demodulator()
+    characters = receiver.push(t_ns[before], polarity[before], begin)
+    receiver.miss(begin, end)
+    characters += receiver.push(t_ns[after], polarity[after], int(t_ns[-1]) + NS)
+    found = [(k, c) for c in characters if not begin - 11e6 < c.t_ns < end + 1e6 and (k := round(c.t_ns / 11e6)) < len(sent)]
+    assert [k for k, c in found if c.status is Status.OK and c.code != ord(sent[k])] == []
+    right = {k for k, c in found if c.code == ord(sent[k])}
+    assert set(range(len(sent))) - right <= set(range(begin // 11_000_000, end // 11_000_000 + 3))
+
+
 @known('what the lost lock gave out in doubt covers the beginning of the next beacon')
 def test_another_beacon_after_the_first_one_is_found():
     first = beacon_events(text_bits(PROSE), 1000.0, tail_s=0.5)

@@ -48,13 +48,23 @@ class Locked:
         self.clock, self.state, self.inverted = lock.clock, lock.detection, lock.inverted
         start_at(self.state, int(lock.positions[0]), 11)
         self.rows = np.zeros((rows, FIRST_RATIO + 11))
+        self.gaps = np.empty((0, 2))
 
     def push(self, t, polarity, t_end):
         """Take events; return the rows and the last status."""
         found, first = [], 0
         while True:
             count, taken, status = detect(
-                self.clock, self.state, TRANSITIONS, LAYOUT, self.inverted, t[first:], polarity[first:], t_end, self.rows
+                self.clock,
+                self.state,
+                TRANSITIONS,
+                LAYOUT,
+                self.inverted,
+                t[first:],
+                polarity[first:],
+                t_end,
+                self.gaps,
+                self.rows,
             )
             found.append(self.rows[:count].copy())
             first += taken

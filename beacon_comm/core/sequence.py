@@ -86,6 +86,7 @@ class SequenceDemodulator:
         self._origin_ns: int | None = None
         self._t = np.empty(0, np.float64)
         self._polarity = np.empty(0, np.int8)
+        self._gaps = np.empty((0, 2))  # whose events are missing
         self._known_to = -math.inf  # the stream's time
         self._taken = 0  # events of the buffer that the lock has seen
         self._given_to = -math.inf  # end of the last character that was given out
@@ -142,6 +143,12 @@ class SequenceDemodulator:
         self._known_to = t_end
         return characters
 
+    def miss(self, start_ns: int, stop_ns: int) -> None:
+        """Hear of missing events; see :class:`beacon_comm.core.demodulator.GapAware`."""
+        if self._origin_ns is not None:
+            gap = np.array([[start_ns - self._origin_ns, stop_ns - self._origin_ns]], np.float64)
+            self._gaps = np.concatenate((self._gaps, gap))
+
     def flush(self) -> list[Character]:
         """End the stream; see :class:`beacon_comm.core.demodulator.Demodulator`."""
         if self._lock is None and len(self._t):
@@ -173,6 +180,7 @@ class SequenceDemodulator:
             self._t[self._taken : stop],
             self._polarity[self._taken : stop],
             until,
+            self._gaps,
             rows,
         )
         self._taken += taken
@@ -356,6 +364,8 @@ class SequenceDemodulator:
         else:
             needed_from = t_end - max(search.longest for search in self._searches)
             first = max(int(np.searchsorted(self._t, needed_from)), len(self._t) - self._most_events)
+        if len(self._gaps):
+            self._gaps = self._gaps[self._gaps[:, 1] > needed_from]
         if first > len(self._t) // 2:
             self._t, self._polarity = self._t[first:].copy(), self._polarity[first:].copy()
             self._taken -= first

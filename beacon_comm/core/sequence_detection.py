@@ -95,6 +95,7 @@ RING = 64
 _RING_MASK = RING - 1
 
 GAIN, SILENCE, USUAL, EMPTY = range(4)
+HEARD, SILENT, MISSING = range(3)
 
 # Whole numbers of the state.
 BIT, LEARNT, NEXT_TABLES, NOISE_RUN, DOUBT, SILENT_RUN, ASLEEP = range(7)
@@ -117,7 +118,8 @@ class Detection(NamedTuple):
         free_metric, free_bits: of the free trellis, ``(CONTEXTS,)`` float64 and int64 (last 64 bits of the path).
         metric, bits, ends, noises: of the framed trellis, ``(states,)`` float64 and int64: the last 64 bits of the
             best path to the state, and for each of them whether it ended a frame or was noise.
-        likelihoods, counts, totals, rises, borders, silent: of the last ``RING`` bits; rises are the ON events.
+        likelihoods, counts, totals, rises, borders, silent: of the last ``RING`` bits; rises are the ON events, and silent is
+            ``HEARD``, ``SILENT`` or ``MISSING``.
         numbers: see the constants above, ``(7,)`` int64.
     """
 
@@ -197,7 +199,7 @@ def start_at(state: Detection, position: int, length: int) -> None:
 
 @njit(cache=True, nogil=True)
 def detect(  # type: ignore[no-untyped-def]
-    clock, state, transitions, layout, inverted, t, polarity, t_end, rows
+    clock, state, transitions, layout, inverted, t, polarity, t_end, gaps, rows
 ):
     """Take events, then the stream's time; write rows of decided words.
 
@@ -207,6 +209,7 @@ def detect(  # type: ignore[no-untyped-def]
         inverted: True if the LED is on for 0.
         t, polarity: events, ns from the origin (float64) and ±1 (int8).
         t_end: the stream's time (ns from the origin).
+        gaps: beginnings and ends of stretches whose events are missing (ns from the origin), ``(k, 2)`` float64.
         rows: ``(n, FIRST_RATIO + length)`` float64, to be written.
 
     Returns:
@@ -226,7 +229,7 @@ def detect(  # type: ignore[no-untyped-def]
         i = take_events(clock, t, polarity, i, sign)
         if i == len(t) and t_end < border:
             return count, i, STILL_LOCKED
-        count = _close_bit(clock, state, transitions, layout, rows, count)
+        count = _close_bit(clock, state, transitions, layout, gaps, rows, count)
         go_on(clock, 1)
         if numbers[DOUBT] > LOST_FRAMES * length:
             return count, i, LOST
@@ -255,7 +258,7 @@ def _wake(clock, state, transitions, t):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _close_bit(clock, state, transitions, layout, rows, count):  # type: ignore[no-untyped-def]
+def _close_bit(clock, state, transitions, layout, gaps, rows, count):  # type: ignore[no-untyped-def]
     """Take the present bit, whose events are all there; return the number of rows."""
     numbers = state.numbers
     place = numbers[BIT] & _RING_MASK
@@ -274,13 +277,19 @@ def _close_bit(clock, state, transitions, layout, rows, count):  # type: ignore[
     numbers[SILENT_RUN] = numbers[SILENT_RUN] + 1 if total == 0 else 0
     likelihoods = state.likelihoods[place]
     weigh(state.tables, counts, likelihoods)
-    silent = total < SILENT_SHARE * state.means.mean() * gain
+    silent = SILENT if total < SILENT_SHARE * state.means.mean() * gain else HEARD
+    for k in range(len(gaps)):
+        if gaps[k, 0] < clock.values[BORDER] + clock.values[PERIOD] and clock.values[BORDER] < gaps[k, 1]:
+            silent = MISSING
     state.silent[place] = silent
-    if numbers[BIT] < MEMORY_BITS - 1 or (silent and silence < RARELY_SILENT):
+    if numbers[BIT] < MEMORY_BITS - 1 or silent == MISSING or (silent and silence < RARELY_SILENT):
         likelihoods[:] = 0.0  # an erasure, or before the first event
     _step_free(state, likelihoods)
     decided = state.free_bits[np.argmax(state.free_metric)] >> EDGE_LAG
-    if (decided ^ decided >> 1) & 1 and numbers[BIT] >= EDGE_LAG + MEMORY_BITS:
+    beside_gap = False
+    for back in range(EDGE_LAG + 2):
+        beside_gap |= state.silent[(numbers[BIT] - back) & _RING_MASK] == MISSING
+    if (decided ^ decided >> 1) & 1 and numbers[BIT] >= EDGE_LAG + MEMORY_BITS and not beside_gap:
         see_edge(clock, decided & 1)
     _step_framed(state, transitions, likelihoods)
     numbers[BIT] += 1
@@ -448,6 +457,8 @@ def _learn_word(state, contexts, first):  # type: ignore[no-untyped-def]
     seen, expected = 0.0, 0.0
     for k in range(len(contexts)):
         context, place = contexts[k], (first + k) & _RING_MASK
+        if silent[place] == MISSING:
+            continue
         levels[SILENCE] += (silent[place] - levels[SILENCE]) / (LEARNING_MEMORY * len(contexts))
         if context == 0 or context == CONTEXTS - 1:
             levels[EMPTY] += ((totals[place] == 0.0) - levels[EMPTY]) / LEARNING_MEMORY
