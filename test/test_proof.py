@@ -168,7 +168,7 @@ def live(bag: Path, folder: Path, rate: float, *parameters: str) -> tuple[Decode
 
     peer = Peer('proof')
     node = NodeProcess(
-        folder, '-r', 'events:=/event_camera/events', '-p', 'qos_reliability:=reliable', '-p',
+        folder, '-r', 'events:=/event_camera/events', '-p', 'qos_reliability:=reliable', '-p', 'max_lag_s:=60.0', '-p',
         f'camera_info_file:={CALIBRATION}', *parameters,
     )  # fmt: skip
     replay = None

@@ -189,6 +189,8 @@ def _node_process(folder: Path) -> contextlib.AbstractContextManager[Child]:
         str(_config('beacon.yaml')),
         '-p',
         f'camera_info_file:={_config("camera_example.yaml")}',
+        '-p',
+        'max_lag_s:=60.0',  # everything is to be read, however slow the machine is
         log=folder / 'node.log',
     )
 

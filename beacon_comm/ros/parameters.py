@@ -29,7 +29,7 @@ class NodeParameters(Declared):
     )
     qos_depth: int = parameter(1000, 'event messages that may wait for the node', 'messages', 1, 100_000)
     max_lag_s: float = parameter(
-        0.05, 'messages that would be read later than this are shed: unread, counted, their characters erased', 's', 0.001, 10.0
+        0.05, 'messages that would be read later than this are shed: unread, counted, characters erased', 's', 0.001, 3600.0
     )
     silent_clock_after_s: float = parameter(
         0.05, 'a topic without messages for this long is silent: its time goes on by the clock …', 's', 0.01, 10.0
