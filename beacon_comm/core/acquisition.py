@@ -94,7 +94,7 @@ class Verdict(NamedTuple):
 
     Attributes:
         passing: words that the free bits confirm.
-        failing: other words, and noise in units of words.
+        failing: other words, and noise and idle bits that are none in units of words.
         idle: bits of idle line.
         covered: bits of passing words.
         changes: of level in a passing word, mean.
@@ -266,11 +266,15 @@ def _read(
     gain = max(1.0, raw.sum() / bits / REFERENCE_EVENTS)
     counts = compression[np.minimum((raw / gain + 0.5).astype(np.int64), len(compression) - 1)]
     likelihoods, free = _learn_free(raw, counts)
-    path, likelihood = framed_path(transitions, likelihoods)
-    other_path, other_likelihood = framed_path(transitions, likelihoods[:, ::-1].copy())
-    inverted = other_likelihood > likelihood
-    if inverted:
-        path, likelihood, free = other_path, other_likelihood, free ^ 1
+    inverted, path, likelihood = False, None, -np.inf
+    for turned in (False, True):
+        if _may_convince(free ^ turned, transitions):
+            other, its_likelihood = framed_path(transitions, likelihoods[:, ::-1].copy() if turned else likelihoods)
+            if its_likelihood > likelihood:
+                inverted, path, likelihood = turned, other, its_likelihood
+    if path is None:
+        return None
+    free = free ^ inverted
     if _judge(path, free, transitions.length)[0] < needed:
         return None
     histograms, likelihoods, path = _learn_framed(counts, path, transitions, inverted)
@@ -539,13 +543,38 @@ def _learn_framed(counts, path, transitions, inverted):  # type: ignore[no-untyp
 
 
 @njit(cache=True, nogil=True)
+def _may_convince(free, transitions):  # type: ignore[no-untyped-def]
+    """Return whether any path could have few enough failing words: reading a path costs far more than this.
+
+    The best path takes words that the free bits confirm, and pays for the zeros beside them; the window may begin and end
+    within a word.
+    """
+    length, words = transitions.length, transitions.words
+    mask = (1 << length) - 1
+    most_failing = LONG_FAILING if len(free) >= LONG_WORDS * length else CLEAR_FAILING
+    merit = np.zeros(len(free) + 1)
+    word = 0
+    for n in range(len(free)):
+        word = (word << 1 | free[n]) & mask
+        if n >= length - 1:
+            merit[n + 1] = merit[n] if free[n] else merit[n] - 1.0 / length
+            if words[word]:
+                merit[n + 1] = max(merit[n + 1], merit[n + 1 - length] + most_failing)
+    return len(free) >= length and merit[len(free) - length + 1 :].max() >= 0.0
+
+
+@njit(cache=True, nogil=True)
 def _judge(path, free, length):  # type: ignore[no-untyped-def]
-    """Return passing words, failing ones (noise in units of words), idle bits, and changes of level in passing words."""
+    """Return passing words, failing ones, idle bits, and changes of level in passing words.
+
+    Noise, and idle line where the free bits are zeros, are failing in units of words.
+    """
     passing, failing, noise, idle, changes = 0, 0, 0, 0, 0
     for n in range(len(path)):
         position = path[n] // (2 * CONTEXTS)
         if position == length:
             idle += 1
+            noise += free[n] == 0
         elif position == length + 1:
             noise += 1
         elif position == length - 1 and n >= length - 1:

@@ -23,6 +23,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from beacon_comm.core.character import Status
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.likelihood import CONTEXTS
 
@@ -43,16 +44,18 @@ NOISE_EXIT_COST = 2.0
 
 
 class Transitions(NamedTuple):
-    """All transitions of the framed trellis, sorted by where they lead.
+    """All transitions of the framed trellis but those into noise, sorted by where they lead.
 
     A state is ``(position · 2 + parity) · CONTEXTS + context``; the position is that of the state's own bit, with
-    ``length`` for idle and ``length + 1`` for noise.
+    ``length`` for idle and ``length + 1`` for noise.  Noise can be entered from everywhere, for ``NOISE_COST``: of the states
+    of one context the best does it.
 
     Attributes:
         source, target: states, ``(n,)`` int32.
         cost: price (nat), ``(n,)`` float64.
         states: number of states.
         length: bits of a frame.
+        words: whether that many bits, the first one most significant, are a frame, ``(2**length,)`` bool.
     """
 
     source: NDArray[np.int32]
@@ -60,6 +63,7 @@ class Transitions(NamedTuple):
     cost: NDArray[np.float64]
     states: int
     length: int
+    words: NDArray[np.bool_]
 
 
 @lru_cache(maxsize=16)
@@ -99,13 +103,9 @@ def framed_transitions(frame: CharacterFrame) -> Transitions:
                     add(here, idle, 0, context, 1, IDLE_COST)
                 else:
                     add_within(here, position + 1, parity, context)
-                for bit in (0, 1):
-                    add(here, noise, 0, context, bit, NOISE_COST)
         here = state(idle, 0, context)
         add(here, idle, 0, context, 1, IDLE_STAY_COST)
         add(here, 0, 0, context, 0, IDLE_STAY_COST)
-        for bit in (0, 1):
-            add(here, noise, 0, context, bit, NOISE_COST)
         here = state(noise, 0, context)
         for bit in (0, 1):
             add(here, noise, 0, context, bit, NOISE_STAY_COST)
@@ -119,6 +119,7 @@ def framed_transitions(frame: CharacterFrame) -> Transitions:
         np.array(cost, np.float64),
         (length + 2) * 2 * CONTEXTS,
         length,
+        np.array([status is Status.OK for _, status in frame.decoding_table()]),
     )
 
 
@@ -152,6 +153,17 @@ def framed_step(source, target, cost, metric, fresh, best, likelihoods):  # type
         if value > fresh[target[i]]:
             fresh[target[i]] = value
             best[target[i]] = source[i]
+    noise = len(metric) - 2 * CONTEXTS
+    for context in range(CONTEXTS):
+        nearest = context
+        for state in range(context, len(metric), CONTEXTS):
+            if metric[state] > metric[nearest]:
+                nearest = state
+        for bit in range(2):
+            to = noise + ((context << 1 | bit) & (CONTEXTS - 1))
+            if metric[nearest] - NOISE_COST > fresh[to]:
+                fresh[to] = metric[nearest] - NOISE_COST
+                best[to] = nearest
     top = UNLIKELY
     for state in range(len(metric)):
         if fresh[state] > UNLIKELY / 2:
@@ -209,7 +221,11 @@ def place_margin(transitions, likelihoods, at):  # type: ignore[no-untyped-def]
     source, target, cost = transitions.source, transitions.target, transitions.cost
     later = np.zeros(transitions.states)
     for n in range(len(likelihoods) - 1, at, -1):
-        fresh[:] = UNLIKELY
+        noise = transitions.states - 2 * CONTEXTS
+        for state in range(transitions.states):
+            to = (state << 1) & (CONTEXTS - 1)
+            low, high = later[noise + to] + likelihoods[n, to], later[noise + to + 1] + likelihoods[n, to + 1]
+            fresh[state] = max(low, high) - NOISE_COST
         for i in range(len(source)):
             value = later[target[i]] + likelihoods[n, target[i] & (CONTEXTS - 1)] - cost[i]
             if value > fresh[source[i]]:
