@@ -347,6 +347,14 @@ def test_a_gap_it_is_told_of_costs_what_it_overlaps_and_two_more(gap_bits, begin
     assert set(range(len(sent))) - right <= set(range(begin // 11_000_000, end // 11_000_000 + 3))
 
 
+@pytest.mark.parametrize('off_bits', [0.1, 0.3, 0.5, 0.7, 0.9])
+def test_after_a_pause_that_ends_beside_the_grid_it_reads_on(off_bits):
+    t_ns, polarity = beacon_events(text_bits(PROSE * 5), 1000.0)
+    pause_from = int(np.searchsorted(t_ns, 11_000_000 * len(PROSE)))
+    t_ns[pause_from:] += round((900 + off_bits) * 1e6)
+    assert text_of(decode(demodulator(), t_ns, polarity)).endswith(PROSE[1:] + PROSE * 3)
+
+
 @known('what the lost lock gave out in doubt covers the beginning of the next beacon')
 def test_another_beacon_after_the_first_one_is_found():
     first = beacon_events(text_bits(PROSE), 1000.0, tail_s=0.5)

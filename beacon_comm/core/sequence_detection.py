@@ -356,6 +356,8 @@ def _decide(clock, state, transitions, layout, best, lag, rows, count):  # type:
                 count += 1
     else:
         numbers[NOISE_RUN] = 0
+        # Idle where the events say 0: a lock whose clock has slipped may read an idle line for ever.
+        numbers[DOUBT] += not state.free_bits[np.argmax(state.free_metric)] >> lag & 1
     return count
 
 
