@@ -8,7 +8,9 @@ import numpy as np
 
 from beacon_comm.core.detection import Detector
 from beacon_comm.core.events import NS_PER_S, EventBatch
-from beacon_comm.core.routing import Routed
+from beacon_comm.core.hop_events import HopEvents
+from beacon_comm.core.parameters import Parameters
+from beacon_comm.core.routing import Routed, Router
 from beacon_comm.core.tracks import TrackChanges
 
 T0_NS = 1 << 40
@@ -67,6 +69,14 @@ def merged(*parts: EventBatch) -> EventBatch:
         np.concatenate([getattr(part, name) for part in parts])[order] for name in ('x', 'y', 'polarity')
     )
     return batch(*columns, np.maximum.accumulate(t_ns[order] - rank) + rank)
+
+
+def gathered(segment: EventBatch, size: tuple[int, int]) -> HopEvents:
+    """Return a segment as the router hands it to the index images."""
+    router = Router(Parameters(), size)
+    router.aim((), int(segment.t_ns[0]) if len(segment) else 0)
+    router.route(segment)
+    return router.close()
 
 
 def hops(events: EventBatch, t_end_ns: int | None = None, hop_ns: int = HOP_NS) -> Iterator[EventBatch]:

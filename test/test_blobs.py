@@ -3,22 +3,26 @@
 import cv2
 import numpy as np
 import pytest
-from disc_events import HOP_NS, T0_NS, batch, disc, hops, merged, noise
+from disc_events import HOP_NS, T0_NS, batch, disc, gathered, hops, merged, noise
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beacon_comm.core.blobs import BlobFinder
 from beacon_comm.core.components import AREA, BOTTOM, COUNT, LEFT, RIGHT, SEEDS, TOP, ComponentFinder
-from beacon_comm.core.index_image import HopEvents, IndexImages
+from beacon_comm.core.hop_events import CODE_BITS, ON, PixelGrid
+from beacon_comm.core.index_image import IndexImages
 from beacon_comm.core.parameters import Parameters
-from beacon_comm.core.routing import Router
 
 SIZE = (96, 70)
 
 
 def packed(segment):
-    x, y = segment.x.astype(np.uint32), segment.y.astype(np.uint32)
-    return HopEvents(y << 16 | x << 2 | (segment.polarity > 0), segment.t_ns)
+    return gathered(segment, SIZE)
+
+
+def image_of(numbered):
+    """Return the pixels of an image by pixel number."""
+    return numbered.reshape(-1, PixelGrid(*SIZE).stride)[: SIZE[1], : SIZE[0]]
 
 
 def blobs_of(events, parameters=None, size=SIZE):
@@ -27,7 +31,7 @@ def blobs_of(events, parameters=None, size=SIZE):
     images, finder = IndexImages(parameters, size), BlobFinder(parameters, size)
     found = []
     for segment in hops(events):
-        images.push(packed(segment))
+        images.push(gathered(segment, size))
         found.append((segment.t_end_ns, finder.find(images, segment.t_end_ns)))
     return found, finder
 
@@ -43,19 +47,19 @@ def test_components_are_those_of_opencv(seed, events, closing_px, grow):
     x = np.abs(np.rint(rng.normal(0, 25, events))).astype(int) % SIZE[0]
     y = (SIZE[1] - 1 - np.abs(np.rint(rng.normal(0, 25, events))).astype(int)) % SIZE[1]
     images = IndexImages(parameters, SIZE)
-    finder = ComponentFinder(parameters, SIZE)
+    finder = ComponentFinder(parameters, images.grid)
     images.push(packed(noise(*SIZE, 50_000, 0.005, seed=seed % 1000)))
-    finder.find(images, images.windows[0])  # leaves nothing behind
+    finder.find(images.windows[0])  # leaves nothing behind
     images.push(packed(batch(x, y, rng.choice([-1, 1], events), np.full(events, T0_NS))))
     window = images.windows[0]
-    components = finder.find(images, window)
+    components = finder.find(window)
 
     index = images.index(window)
     low = (index >= 0.5 * grow).astype(np.uint8)
     square = np.ones((closing_px, closing_px), np.uint8)
     closed = cv2.morphologyEx(low, cv2.MORPH_CLOSE, square)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
-    label = components.label.reshape(SIZE[1], SIZE[0])
+    label = image_of(components.label)
     if closing_px % 2:  # OpenCV moves the result of an even square
         np.testing.assert_array_equal(label > 0, closed > 0)
         assert len(components) == count - 1
@@ -65,13 +69,12 @@ def test_components_are_those_of_opencv(seed, events, closing_px, grow):
             left, top, width, height, area = stats[other[0]]
             s = components.sums[c]
             assert (s[LEFT], s[TOP], s[RIGHT], s[BOTTOM]) == (left, top, left + width - 1, top + height - 1)
-            assert s[AREA] == area == len(components.pixels_of(c))
+            assert s[AREA] == area == np.diff(components.run[components.first[c] : components.first[c + 1]]).sum()
     for c in range(len(components)):
         mine = label == c + 1
         assert components.index[c] == pytest.approx(index[mine].mean())
         assert components.sums[c, SEEDS] == (index[mine] >= 0.5).sum()
-        counts = window.counts.reshape(SIZE[1], SIZE[0], 2)
-        assert components.sums[c, COUNT] == counts[mine].sum()
+        assert components.sums[c, COUNT] == images.counts(window)[:, mine].sum()
     assert ((label > 0) | (low == 0)).all()  # closing loses nothing
 
 
@@ -152,7 +155,7 @@ def test_owner_names_the_blob_of_each_pixel_and_is_cleared():
     images.push(packed(segments[0]))
     images.push(packed(segments[1]))
     blobs = finder.find(images, segments[1].t_end_ns)
-    owner = finder.owner.reshape(SIZE[1], SIZE[0])
+    owner = image_of(finder.owner)
     for number, blob in enumerate(blobs, 1):
         assert owner[round(blob.y_px), round(blob.x_px)] == number
         assert (owner == number).sum() == blob.area_px
@@ -177,11 +180,13 @@ def test_noise_makes_no_blob():
     assert not any(blobs for _, blobs in found)
 
 
-def test_routers_words_are_what_images_count():
-    """The word format is written by the router and read here."""
+def test_the_routers_words_are_the_events_band_by_band():
     segment = next(iter(hops(noise(*SIZE, 100_000, 0.005))))
-    router = Router(Parameters(), SIZE)
-    router.route(segment)
-    gathered = router.close()
-    np.testing.assert_array_equal(gathered.word, packed(segment).word)
-    np.testing.assert_array_equal(gathered.t_ns, segment.t_ns)
+    events, grid = packed(segment), PixelGrid(*SIZE)
+    band = np.repeat(np.arange(grid.bands), np.diff(events.first))
+    y, x = np.divmod(band * 4096 + (events.code >> CODE_BITS), grid.stride)
+    order = np.argsort(segment.y // (4096 // grid.stride), kind='stable')
+    np.testing.assert_array_equal(x, segment.x[order])
+    np.testing.assert_array_equal(y, segment.y[order])
+    np.testing.assert_array_equal((events.code & ON) > 0, segment.polarity[order] > 0)
+    np.testing.assert_array_equal(events.t_start_ns + events.offset_ns.astype(np.int64), segment.t_ns[order])

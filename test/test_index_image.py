@@ -2,20 +2,18 @@
 
 import numpy as np
 import pytest
-from disc_events import HOP_NS, T0_NS, batch, hops, noise
+from disc_events import HOP_NS, T0_NS, batch, gathered, hops, noise
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from beacon_comm.core.index_image import NO_EVENTS, HopEvents, IndexImages, whole_hops
+from beacon_comm.core.index_image import MOST_COUNTED, IndexImages, whole_hops
 from beacon_comm.core.parameters import Parameters
 
 SIZE = (40, 30)
 
 
 def hop_events(segment):
-    """Pack a segment as the module's head draws it."""
-    x, y = segment.x.astype(np.uint32), segment.y.astype(np.uint32)
-    return HopEvents(y << 16 | x << 2 | (segment.polarity > 0), segment.t_ns)
+    return gathered(segment, SIZE)
 
 
 def expected_index(events, t_from, t_to, offset=10.0):
@@ -40,10 +38,9 @@ def test_sliding_windows_equal_counting_from_scratch(threshold, offset):
             np.testing.assert_array_equal(
                 images.index(window), expected_index(events, start, segment.t_end_ns, offset)
             )
-            counted = window.counts.reshape(SIZE[1], SIZE[0], 2).sum(axis=2)
-            assert window.events == counted.sum()
-            low = images.low_pixels(window)
-            assert sorted(low) == np.flatnonzero(images.index(window) >= parameters.index_threshold / 2).tolist()
+            assert window.events == images.counts(window).sum() == window.counts.sum()
+            low = images.index(window) >= parameters.index_threshold / 2
+            np.testing.assert_array_equal(images.low_pixels(window), low)
 
 
 def test_windows_run_empty():
@@ -51,10 +48,27 @@ def test_windows_run_empty():
     images.push(hop_events(noise(*SIZE, 10_000, 0.009)))
     assert not images.empty
     for _ in range(images.windows[-1].hops):
-        images.push(NO_EVENTS)
+        images.push(hop_events(batch([], [], [], [])))
     assert images.empty
-    assert not any(window.counts.any() or len(images.low_pixels(window)) for window in images.windows)
-    assert not any(window.mark.any() for window in images.windows)
+    assert not any(window.counts.any() or window.low.any() for window in images.windows)
+
+
+def test_a_count_ends_and_runs_empty_again():
+    """What is not counted is not taken off either, in whichever window it was."""
+    images = IndexImages(Parameters(), SIZE)
+    many = MOST_COUNTED - 10
+    lone = hop_events(batch([7], [3], [-1], [T0_NS]))
+    full = batch([7] * many, [3] * many, [1] * many, np.full(many, T0_NS))
+    images.push(hop_events(full))
+    images.push(hop_events(full))
+    for window in images.windows:
+        assert images.counts(window)[:, 3, 7].tolist() == [0, MOST_COUNTED]
+    images.push(lone)
+    assert images.counts(images.windows[0])[:, 3, 7].tolist() == [1, 10]  # those of the first hop are gone
+    assert images.counts(images.windows[1])[:, 3, 7].tolist() == [1, MOST_COUNTED]
+    for _ in range(images.windows[-1].hops):
+        images.push(hop_events(batch([], [], [], [])))
+    assert not any(window.counts.any() for window in images.windows)
 
 
 def test_a_long_window_no_longer_than_the_short_one_is_not_kept():
@@ -92,7 +106,7 @@ def test_the_ring_is_bounded_and_overflow_counted(sizes, max_bytes):
         for window in images.windows:
             assert window.counts.sum() == window.events
             assert window.counts.min() >= 0
-    if sum(sizes) * 12 <= max_bytes:
+    if sum(sizes) * 6 <= max_bytes:
         assert images.overflow_events == 0
     assert images.windows[-1].events + images.overflow_events <= pushed
 

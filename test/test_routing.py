@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beacon_comm.core.event_buffer import EVENT_BYTES, EventBuffer, buffer_length_ns
+from beacon_comm.core.hop_events import ROUTED
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.routing import Router
 from beacon_comm.core.tracks import Track
@@ -58,7 +59,7 @@ def test_every_event_goes_to_the_nearest_track_that_holds_it(seed, count):
     assert {i: list(zip(p.t_ns.tolist(), p.polarity.tolist(), strict=True)) for i, p in routed.items()} == expected
     assert list(routed) == sorted(routed)
     assert router.gathered == 200
-    assert (router.close().word & 2 > 0).sum() == sum(len(part.t_ns) for part in routed.values())
+    assert (router.close().code & ROUTED > 0).sum() == sum(len(part.t_ns) for part in routed.values())
 
 
 def test_a_fast_track_takes_its_events_along():
@@ -91,7 +92,7 @@ def test_without_tracks_nothing_is_routed_but_all_is_gathered():
     for k in range(20):
         assert router.route(events(1000, k)) == []
     gathered = router.close()
-    assert len(gathered) == 20_000 and not (gathered.word & 2).any()
+    assert len(gathered) == 20_000 and not (gathered.code & ROUTED).any()
     assert router.gathered == 0
 
 

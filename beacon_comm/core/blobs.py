@@ -36,8 +36,10 @@ from beacon_comm.core.components import (
     TOP,
     ComponentFinder,
     ComponentSet,
+    paint,
 )  # fmt: skip
-from beacon_comm.core.index_image import HopEvents, IndexImages, Window, hop_length_ns
+from beacon_comm.core.hop_events import BAND_PIXELS, BAND_SHIFT, CODE_BITS, HopEvents, PixelGrid
+from beacon_comm.core.index_image import IndexImages, Window, hop_length_ns
 from beacon_comm.core.nearest import CELL_SHIFT, cell_lists, cells_along
 from beacon_comm.core.parameters import Parameters
 
@@ -89,26 +91,26 @@ class BlobFinder:
         sensor_size: width and height (px).
 
     Attributes:
-        owner: for every pixel, 1 + the number of the blob in the last :meth:`find`'s list that it is of,
-            0 for none, -1 for a component that is too large, ``(height width,)`` int32.
+        owner: for every pixel number, 1 + the number of the blob in the last :meth:`find`'s list that it is of,
+            0 for none, -1 for a component that is too large, int32.
     """
 
     def __init__(self, parameters: Parameters, sensor_size: tuple[int, int]) -> None:
         self._parameters = parameters
-        self._size = sensor_size
+        self._grid = PixelGrid(*sensor_size)
         self._hop_ns = hop_length_ns(parameters)
-        self._finders = [ComponentFinder(parameters, sensor_size) for _ in range(2)]
+        self._finders = [ComponentFinder(parameters, self._grid) for _ in range(2)]
         self._sets: list[ComponentSet] = []
-        self.owner = np.zeros(sensor_size[0] * sensor_size[1], np.int32)
+        self.owner = np.zeros(self._grid.numbers, np.int32)
 
     def find(self, images: IndexImages, t_hop_ns: int) -> list[Blob]:
         """Return the blobs at the hop that ends at ``t_hop_ns`` (ns)."""
         for components in self._sets:
-            self.owner[components.pixel[: components.first[-1]]] = 0
+            paint(components.run, self.owner, 0)
         self._sets = []
         if images.empty:
             return []
-        self._sets = [f.find(images, window) for f, window in zip(self._finders, images.windows, strict=False)]
+        self._sets = [f.find(window) for f, window in zip(self._finders, images.windows, strict=False)]
         standing = self._choose(images.windows)
         window = np.repeat(np.arange(len(standing)), [len(numbers) for numbers in standing])
         if len(window) == 0:
@@ -129,16 +131,16 @@ class BlobFinder:
         if len(self._sets) > 1:
             long = self._sets[1]
             stands[1] &= _long_stands(
-                long.pixel, long.first, stands[1], short.label, stands[0], windows[0].counts
+                long.run, long.first, stands[1], short.label, stands[0], windows[0].counts
             )
         chosen = [np.flatnonzero(which) for which in stands]
         number = np.where(short.sums[:, AREA] > p.max_area_px, -1, 0)
         number[chosen[0]] = np.arange(1, 1 + len(chosen[0]))
-        _own(short.pixel, short.first, number, self.owner)
+        _own(short.run, short.first, number, self.owner)
         if len(self._sets) > 1:
             number = np.zeros(len(stands[1]), np.int64)
             number[chosen[1]] = np.arange(1 + len(chosen[0]), 1 + len(chosen[0]) + len(chosen[1]))
-            _own(long.pixel, long.first, number, self.owner)
+            _own(long.run, long.first, number, self.owner)
         return chosen
 
     def _blobs(
@@ -152,7 +154,7 @@ class BlobFinder:
     ) -> list[Blob]:
         """Observe the components that stand; see the module's head."""
         x, y, extent = _centre_and_extent(*(sums[:, k] for k in (COUNT, COUNT_X, COUNT_Y, COUNT_RR)))
-        n, sum_x, sum_y, sum_rr, sum_t = self._sum_newest(x, y, extent, sums, newest, t_hop_ns - self._hop_ns).T
+        n, sum_x, sum_y, sum_rr, sum_t = self._sum_newest(x, y, extent, sums, newest).T
         new_x, new_y, spread = _centre_and_extent(np.maximum(n, 1), sum_x, sum_y, sum_rr)
         fresh = n >= np.maximum(_FRESH_EVENTS, _FRESH_SHARE * sums[:, COUNT] / length)
         new_t = t_hop_ns - self._hop_ns + sum_t // np.maximum(n, 1)
@@ -169,11 +171,10 @@ class BlobFinder:
         extent: NDArray[np.float64],
         sums: NDArray[np.int64],
         newest: HopEvents,
-        t_start_ns: int,
     ) -> NDArray[np.int64]:
-        """Return n, Σx, Σy, Σ(x² + y²), Σ(t - t_start) of each blob's newest events, ``(m, 5)`` int64."""
+        """Return n, Σx, Σy, Σ(x² + y²), Σ(t - hop's begin) of each blob's newest events, ``(m, 5)`` int64."""
         p = self._parameters
-        width, height = self._size
+        width, height = self._grid.width, self._grid.height
         radius = extent * p.routing_extent_factor + p.routing_margin_px
         box = np.stack(
             (
@@ -187,8 +188,9 @@ class BlobFinder:
         first, member = cell_lists(box, width, height)
         circle = np.stack((x, y, radius), axis=1)
         summed: NDArray[np.int64] = _sum_newest(
-            newest.word, newest.t_ns, t_start_ns, width, cells_along(width), first, member, circle, self.owner
-        )
+            newest.code, newest.offset_ns, newest.first, self._grid.shift, cells_along(width),
+            first, member, circle, self.owner,
+        )  # fmt: skip
         return summed
 
 
@@ -202,68 +204,77 @@ def _centre_and_extent(
 
 
 @njit(cache=True, nogil=True)
-def _own(pixel, first, number, owner):  # type: ignore[no-untyped-def]
+def _own(run, first, number, owner):  # type: ignore[no-untyped-def]
     """Give every pixel of a component the component's number, unless that is 0."""
     for c in range(len(number)):
         if number[c] != 0:
-            for k in range(first[c], first[c + 1]):
-                owner[pixel[k]] = number[c]
+            paint(run[first[c] : first[c + 1]], owner, number[c])
 
 
 @njit(cache=True, nogil=True)
-def _long_stands(pixel, first, fits, short_label, short_fits, short_counts):  # type: ignore[no-untyped-def]
+def _long_stands(run, first, fits, short_label, short_fits, short_counts):  # type: ignore[no-untyped-def]
     """Return which components of the long window stand; the short ones they stand for stop standing."""
     stands = np.zeros(len(fits), np.bool_)
     for c in range(len(fits)):
         if not fits[c]:
             continue
-        area_in = area_out = count_in = count_out = 0
+        area_in = area_out = 0
+        count_in = count_out = np.int64(0)
         for k in range(first[c], first[c + 1]):
-            p = pixel[k]
-            n = int(short_counts[2 * p] + short_counts[2 * p + 1])
-            s = short_label[p] - 1
-            if s >= 0 and short_fits[s]:
-                area_in += 1
-                count_in += n
-            else:
-                area_out += 1
-                count_out += n
+            for p in range(run[k, 0], run[k, 1]):
+                n = np.int64(short_counts[0, p]) + np.int64(short_counts[1, p])
+                s = short_label[p] - 1
+                if s >= 0 and short_fits[s]:
+                    area_in += 1
+                    count_in += n
+                else:
+                    area_out += 1
+                    count_out += n
         partial = area_out > area_in and count_out * area_in >= _AS_ACTIVE * count_in * area_out
         stands[c] = area_in == 0 or partial
     for c in range(len(fits)):
         if stands[c]:
             for k in range(first[c], first[c + 1]):
-                s = short_label[pixel[k]] - 1
-                if s >= 0:
-                    short_fits[s] = False
+                for p in range(run[k, 0], run[k, 1]):
+                    s = short_label[p] - 1
+                    if s >= 0:
+                        short_fits[s] = False
     return stands
 
 
 @njit(cache=True, nogil=True)
 def _sum_newest(  # type: ignore[no-untyped-def]
-    word, t_ns, t_start_ns, width, cells_across, first, member, circle, owner
+    code, offset_ns, band_first, shift, cells_across, first, member, circle, owner
 ):
     """Sum up the newest events of each blob; see :meth:`BlobFinder._sum_newest`."""
     sums = np.zeros((len(circle), 5), np.int64)
-    for i in range(len(word)):
-        x = np.int64((word[i] >> 2) & 0x3FFF)
-        y = np.int64(word[i] >> 16)
-        cell = (y >> CELL_SHIFT) * cells_across + (x >> CELL_SHIFT)
-        if first[cell] == first[cell + 1]:
+    cell_rows = (len(first) - 1) // cells_across
+    for band in range(len(band_first) - 1):
+        start = band << BAND_SHIFT
+        top = min((start >> shift) >> CELL_SHIFT, cell_rows)
+        bottom = min((((start + BAND_PIXELS - 1) >> shift) >> CELL_SHIFT) + 1, cell_rows)
+        if first[top * cells_across] == first[bottom * cells_across]:
             continue
-        b = np.int64(owner[y * width + x]) - 1
-        if b == -1:
-            nearest2 = np.inf
-            for k in range(first[cell], first[cell + 1]):
-                m = member[k]
-                d2 = (x - circle[m, 0]) ** 2 + (y - circle[m, 1]) ** 2
-                if d2 <= circle[m, 2] ** 2 and d2 < nearest2:
-                    nearest2 = d2
-                    b = m
-        if b >= 0:
-            sums[b, 0] += 1
-            sums[b, 1] += x
-            sums[b, 2] += y
-            sums[b, 3] += x * x + y * y
-            sums[b, 4] += t_ns[i] - t_start_ns
+        for i in range(band_first[band], band_first[band + 1]):
+            p = start + (np.int64(code[i]) >> CODE_BITS)
+            y = p >> shift
+            x = p - (y << shift)
+            cell = (y >> CELL_SHIFT) * cells_across + (x >> CELL_SHIFT)
+            if first[cell] == first[cell + 1]:
+                continue
+            b = np.int64(owner[p]) - 1
+            if b == -1:
+                nearest2 = np.inf
+                for k in range(first[cell], first[cell + 1]):
+                    m = member[k]
+                    d2 = (x - circle[m, 0]) ** 2 + (y - circle[m, 1]) ** 2
+                    if d2 <= circle[m, 2] ** 2 and d2 < nearest2:
+                        nearest2 = d2
+                        b = m
+            if b >= 0:
+                sums[b, 0] += 1
+                sums[b, 1] += x
+                sums[b, 2] += y
+                sums[b, 3] += x * x + y * y
+                sums[b, 4] += offset_ns[i]
     return sums

@@ -1,9 +1,11 @@
-"""Connected components of high-index pixels: compiled, and only where there are events.
+"""Connected components of high-index pixels: compiled, 64 pixels at a time, and only where there are some.
 
-    low: I >= share * threshold ─► closed: low • square ─► components, 8-connected ─► with a seed: I >= threshold
+    low: I >= share * threshold ─► closed: low • square ─► runs ─► components, 8-connected ─► with a seed: I >= threshold
 
-A pixel set is a list of pixel numbers (y width + x) and an image of marks; only listed pixels are ever visited
-and cleared again, so that an image that is dark but for a few blobs costs next to nothing.
+    bits      . 1 1 1 . . 1 . . 1 1 .       the rows of a pixel set, 64 pixels to a word: closing is shifts, ORs and ANDs
+    runs        '-----'   '   '---'         what a row's words hold; a run joins the runs it touches in the row above
+
+Components and their runs are in the order in which a reader meets them, row by row.
 
 Why two thresholds: while a beacon is near the threshold some of its pixels are above and some below, and one
 threshold breaks it into fragments.  Its pixels are all alike, so nearly all of them are above half of it.
@@ -17,14 +19,18 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from beacon_comm.core.index_image import IndexImages, Window
+from beacon_comm.core.hop_events import PixelGrid
+from beacon_comm.core.index_image import WORD_SHIFT, Window
 from beacon_comm.core.parameters import Parameters
 
 # Columns of ComponentSet.sums.
 AREA, SEEDS, COUNT, COUNT_X, COUNT_Y, COUNT_RR, LEFT, RIGHT, TOP, BOTTOM = range(10)
 
-# Marks of the morphological closing, one bit a step.
-_SEEN, _WIDE, _DILATED, _NARROW, _CLOSED = 1, 2, 4, 8, 16
+_ALL = np.uint64(0xFFFF_FFFF_FFFF_FFFF)
+_NONE = np.uint64(0)
+_DE_BRUIJN = np.uint64(0x03F7_9D71_B4CB_0A89)
+_PLACES = np.empty(64, np.int64)
+_PLACES[[(1 << k) * int(_DE_BRUIJN) % (1 << 64) >> 58 for k in range(64)]] = np.arange(64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,16 +38,17 @@ class ComponentSet:
     """The components of one window.
 
     Attributes:
-        label: component of every pixel from 1 on, 0 for none, ``(height width,)`` int32.
-        pixel: numbers of their pixels, component after component, int32.
-        first: where each component's pixels begin in ``pixel``, ``(m + 1,)`` int64.
+        label: component of every pixel from 1 on, 0 for none, by pixel number, int32.
+        run: pixels on end in a row, component after component: number of the first one, and of the one behind the
+            last one, ``(r, 2)`` int32.
+        first: where each component's runs begin in ``run``, ``(m + 1,)`` int64.
         sums: ``(m, 10)`` int64: area, pixels above the threshold, events n, Σ n x, Σ n y, Σ n (x² + y²),
             and the box left, right, top, bottom (inclusive).
         index: mean of I over the component's pixels, ``(m,)`` float64.
     """
 
     label: NDArray[np.int32]
-    pixel: NDArray[np.int32]
+    run: NDArray[np.int32]
     first: NDArray[np.int64]
     sums: NDArray[np.int64]
     index: NDArray[np.float64]
@@ -49,161 +56,245 @@ class ComponentSet:
     def __len__(self) -> int:
         return len(self.index)
 
-    def pixels_of(self, component: int) -> NDArray[np.int32]:
-        """Return the pixel numbers of a component, counted from 0."""
-        return self.pixel[self.first[component] : self.first[component + 1]]
-
 
 class ComponentFinder:
     """Finds the components of one window; keeps the images it works in.
 
     Args:
         parameters: ``index_threshold``, ``index_offset``, ``closing_px``.
-        sensor_size: width and height (px).
+        grid: how the sensor's pixels are numbered.
     """
 
-    def __init__(self, parameters: Parameters, sensor_size: tuple[int, int]) -> None:
-        self._width, self._height = sensor_size
-        size = self._width * self._height
+    def __init__(self, parameters: Parameters, grid: PixelGrid) -> None:
+        self._grid = grid
         self._threshold = parameters.index_threshold
         self._offset = parameters.index_offset
         self._closing_px = parameters.closing_px
-        self._mark = np.zeros(size, np.uint8)
-        self._label = np.zeros(size, np.int32)
-        self._pixel = np.empty(size, np.int32)
-        self._list = np.empty(size, np.int32)
-        self._labelled = 0
+        words = ((grid.width - 1) >> WORD_SHIFT) + 1
+        self._wide = np.zeros((grid.height, words), np.uint64)
+        self._closed = np.zeros((grid.height, words), np.uint64)
+        self._label = np.zeros(grid.numbers, np.int32)
+        self._run = np.empty((0, 2), np.int32)
 
-    def find(self, images: IndexImages, window: Window) -> ComponentSet:
-        """Return the components of ``window``, in the order in which their pixels were listed.
-
-        The arrays of the result are valid until the next call.
-        """
-        self._label[self._pixel[: self._labelled]] = 0
-        low = images.low_pixels(window)
-        width, height, found = self._width, self._height, len(low)
-        self._list[:found] = low
-        self._mark[low] = _SEEN
+    def find(self, window: Window) -> ComponentSet:
+        """Return the components of ``window``; the label image is valid until the next call."""
+        paint(self._run, self._label, 0)
+        bits = window.low
         if self._closing_px > 1:
-            found = _close(self._mark, self._list, self._pixel, found, width, height, self._closing_px)
-        else:
-            self._mark[low] = _CLOSED
-        first, sums, index = _label_components(
-            window.counts, width, height, self._threshold, self._offset, self._mark, self._list, found,
-            self._label, self._pixel,
-        )  # fmt: skip
-        self._labelled = found
-        return ComponentSet(self._label, self._pixel, first, sums, index)
+            _close(bits, self._closing_px, self._grid.width, self._wide, self._closed)
+            bits = self._closed
+        self._run, first, sums, index = _find_components(
+            bits, self._grid.width, self._grid.shift, window.counts, self._threshold, self._offset, self._label
+        )
+        return ComponentSet(self._label, self._run, first, sums, index)
 
 
 @njit(cache=True, nogil=True)
-def _close(mark, listed, spare, found, width, height, side):  # type: ignore[no-untyped-def]
-    """Close the marked set with a square of ``side`` pixels; beyond the border counts as set when eroding.
+def paint(run, image, value):  # type: ignore[no-untyped-def]
+    """Set an image to ``value`` where there are runs."""
+    for k in range(len(run)):
+        for p in range(run[k, 0], run[k, 1]):
+            image[p] = value
 
-    ``listed`` then holds the closed set, marked ``_CLOSED`` alone.  Row by row, then column by column.
+
+@njit(cache=True, nogil=True)
+def _close(low, side, width, wide, closed):  # type: ignore[no-untyped-def]
+    """Close the set with a square of ``side`` pixels; beyond the border counts as set when eroding.
+
+    Row by row, then column by column; a row without a set pixel near it is passed over.
     """
+    height, words = closed.shape
     before, after = side // 2, side - 1 - side // 2
-    wide = 0
-    for i in range(found):
-        p = np.int64(listed[i])
-        x = p - _row(p, width) * width
-        for q in range(p - min(before, x), p + min(after, width - 1 - x) + 1):
-            if not mark[q] & _WIDE:
-                mark[q] |= _WIDE
-                spare[wide] = q
-                wide += 1
-    dilated = 0
-    for i in range(wide):
-        p = np.int64(spare[i])
-        y = _row(p, width)
-        for q in range(p - min(before, y) * width, p + min(after, height - 1 - y) * width + 1, width):
-            if not mark[q] & _DILATED:
-                mark[q] |= _DILATED
-                listed[dilated] = q
-                dilated += 1
-    for i in range(dilated):
-        p = np.int64(listed[i])
-        x = p - _row(p, width) * width
-        common = _DILATED
-        for q in range(p - min(before, x), p + min(after, width - 1 - x) + 1):
-            common &= mark[q]
-        if common:
-            mark[p] |= _NARROW
-    for i in range(dilated):
-        p = np.int64(listed[i])
-        if mark[p] & _NARROW:
-            y = _row(p, width)
-            common = _NARROW
-            for q in range(p - min(before, y) * width, p + min(after, height - 1 - y) * width + 1, width):
-                common &= mark[q]
-            if common:
-                mark[p] |= _CLOSED
-    closed = 0
-    for i in range(dilated):
-        p = np.int64(listed[i])
-        mark[p] &= _CLOSED
-        if mark[p]:
-            listed[closed] = p
-            closed += 1
-    return closed
+    last = _ALL >> np.uint64(-width & 63)  # the pixels of a row's last word
+    spread = np.empty(words, np.uint64)
+    for y in range(height):
+        _widen(low[y, :words], before, after, wide[y])
+        wide[y, -1] &= last
+    for y in range(height):  # a row's pixels reach the rows y - before … y + after
+        spread[:] = _NONE
+        for other in range(max(y - after, 0), min(y + before, height - 1) + 1):
+            for k in range(words):
+                spread[k] |= wide[other, k]
+        _narrow(spread, before, after, last, closed[y])
+    # Eroding by columns: of the rows y - before … y + after, which the rows above must not have lost yet.
+    for y in range(height):
+        spread[:] = _ALL
+        for other in range(max(y - before, 0), min(y + after, height - 1) + 1):
+            for k in range(words):
+                spread[k] &= closed[other, k]
+        wide[y, :] = spread
+    closed[:, :] = wide
 
 
 @njit(cache=True, nogil=True)
-def _row(p, width):  # type: ignore[no-untyped-def]
-    """Return p // width; the division of unsigned 32-bit numbers is several times as fast as that of int64."""
-    return np.int64(np.uint32(p) // np.uint32(width))
+def _widen(row, before, after, out):  # type: ignore[no-untyped-def]
+    """Dilate a row: pixel x sets x - before … x + after."""
+    some = _NONE
+    for k in range(len(out)):
+        some |= row[k]
+        out[k] = row[k]
+    if some:
+        for step in range(1, before + 1):
+            for k in range(len(out)):
+                out[k] |= row[k] >> np.uint64(step)
+                if k + 1 < len(out):
+                    out[k] |= row[k + 1] << np.uint64(64 - step)
+        for step in range(1, after + 1):
+            for k in range(len(out)):
+                out[k] |= row[k] << np.uint64(step)
+                if k:
+                    out[k] |= row[k - 1] >> np.uint64(64 - step)
 
 
 @njit(cache=True, nogil=True)
-def _label_components(  # type: ignore[no-untyped-def]
-    counts, width, height, threshold, offset, mark, listed, found, label, pixel
-):
-    """Label the marked pixels, gather them component by component in ``pixel``, sum up; clear the marks.
+def _narrow(row, before, after, last, out):  # type: ignore[no-untyped-def]
+    """Erode a row, given as a copy: pixel x stays if x - before … x + after are set or beyond the border."""
+    end = len(out) - 1
+    some = _NONE
+    for k in range(len(out)):
+        some |= row[k]
+    row[end] |= ~last
+    out[:] = _NONE
+    if some:
+        out[:] = row
+        for step in range(1, after + 1):
+            for k in range(len(out)):
+                right = row[k + 1] if k < end else _ALL
+                out[k] &= row[k] >> np.uint64(step) | right << np.uint64(64 - step)
+        for step in range(1, before + 1):
+            for k in range(len(out)):
+                left = row[k - 1] if k else _ALL
+                out[k] &= row[k] << np.uint64(step) | left >> np.uint64(64 - step)
+        out[end] &= last
 
-    ``pixel`` is also the queue of the flood: what is behind its end has been visited.
-    """
-    room = 256
-    first, sums, index = np.zeros(room + 1, np.int64), np.zeros((room, 10), np.int64), np.zeros(room)
+
+@njit(cache=True, nogil=True)
+def _lowest(bits):  # type: ignore[no-untyped-def]
+    """Return the place of the lowest set bit of a word that has one: 2ᵏ times a de Bruijn number begins with k's 6 bits."""
+    lowest = bits & (~bits + np.uint64(1))
+    return _PLACES[(lowest * _DE_BRUIJN) >> np.uint64(58)]
+
+
+@njit(cache=True, nogil=True)
+def _find_runs(bits, width, shift):  # type: ignore[no-untyped-def]
+    """List the runs of all rows, ``(r, 2)`` int32 as in ComponentSet, and where each row's begin, ``(height + 1,)``."""
+    height, words = len(bits), ((width - 1) >> WORD_SHIFT) + 1
+    row_first = np.zeros(height + 1, np.int64)
+    run = np.empty((1024, 2), np.int32)
+    n = 0
+    for y in range(height):
+        start = -1  # of a run that reaches the end of the word before
+        for k in range(words):
+            word = bits[y, k]
+            if n + 64 > len(run):
+                run = np.concatenate((run, np.empty_like(run)))
+            at = (y << shift) + (k << WORD_SHIFT)
+            if start >= 0:
+                if word == _ALL:
+                    continue
+                place = _lowest(~word)
+                run[n, 0], run[n, 1] = start, at + place
+                n += 1
+                start = -1
+                word &= ~((np.uint64(1) << np.uint64(place)) - np.uint64(1))
+            while word:
+                begin = _lowest(word)
+                beyond = ~(word >> np.uint64(begin))  # zeros shifted in: set
+                length = _lowest(beyond) if beyond else 64
+                if begin + length >= 64:
+                    start = at + begin
+                    break
+                run[n, 0], run[n, 1] = at + begin, at + begin + length
+                n += 1
+                word &= ~(((np.uint64(1) << np.uint64(length)) - np.uint64(1)) << np.uint64(begin))
+        if start >= 0:
+            run[n, 0], run[n, 1] = start, (y << shift) + width
+            n += 1
+        row_first[y + 1] = n
+    return run[:n], row_first
+
+
+@njit(cache=True, nogil=True)
+def _root(parent, k):  # type: ignore[no-untyped-def]
+    while parent[k] != k:
+        parent[k] = parent[parent[k]]
+        k = parent[k]
+    return k
+
+
+@njit(cache=True, nogil=True)
+def _join_runs(run, row_first, stride):  # type: ignore[no-untyped-def]
+    """Return each run's component, numbered as they are met, ``(r,)`` int32, and how many there are."""
+    parent = np.arange(len(run))
+    for y in range(1, len(row_first) - 1):
+        above, end = row_first[y - 1], row_first[y]
+        for k in range(end, row_first[y + 1]):
+            left, right = run[k, 0] - stride - 1, run[k, 1] - stride + 1  # 8-connected: one more on either side
+            while above < end and run[above, 1] <= left:
+                above += 1
+            other = above
+            while other < end and run[other, 0] < right:
+                a, b = _root(parent, other), _root(parent, k)
+                parent[max(a, b)] = min(a, b)
+                other += 1
+    number = np.empty(len(run), np.int32)
     m = 0
-    end = 0
-    for i in range(found):
-        if not mark[listed[i]]:
-            continue
-        if m == room:
-            room *= 2
-            first = np.append(first, np.zeros(m, np.int64))
-            sums = np.concatenate((sums, np.zeros((m, 10), np.int64)))
-            index = np.append(index, np.zeros(m))
-        mark[listed[i]] = 0
-        pixel[end] = listed[i]
-        at, end = end, end + 1
-        seeds, n_sum, x_sum, y_sum, rr_sum, index_sum = 0, 0, 0, 0, 0, 0.0
-        left, right, top, bottom = width, 0, height, 0
-        while at < end:
-            p = np.int64(pixel[at])
-            at += 1
-            label[p] = m + 1
-            y = _row(p, width)
-            x = p - y * width
-            on, off = int(counts[2 * p + 1]), int(counts[2 * p])
-            n, base = on + off, offset + abs(on - off)
-            index_sum += n / base
-            seeds += n >= threshold * base
-            n_sum += n
-            x_sum += n * x
-            y_sum += n * y
-            rr_sum += n * (x * x + y * y)
-            left, right, top, bottom = min(left, x), max(right, x), min(top, y), max(bottom, y)
-            for row in range(p - min(1, y) * width, p + min(1, height - 1 - y) * width + 1, width):
-                for q in range(row - min(1, x), row + min(1, width - 1 - x) + 1):
-                    if mark[q]:
-                        mark[q] = 0
-                        pixel[end] = q
-                        end += 1
-        s = sums[m]
-        s[AREA], s[SEEDS], s[COUNT], s[COUNT_X], s[COUNT_Y] = end - first[m], seeds, n_sum, x_sum, y_sum
-        s[COUNT_RR], s[LEFT], s[RIGHT], s[TOP], s[BOTTOM] = rr_sum, left, right, top, bottom
-        index[m] = index_sum / s[AREA]
-        m += 1
-        first[m] = end
-    return first[: m + 1], sums[:m], index[:m]
+    for k in range(len(run)):
+        if parent[k] == k:
+            number[k] = m
+            m += 1
+        else:
+            number[k] = number[_root(parent, k)]
+    return number, m
+
+
+@njit(cache=True, nogil=True)
+def _find_components(bits, width, shift, counts, threshold, offset, label):  # type: ignore[no-untyped-def]
+    """Join the runs of a set, sum each component up, label its pixels; return runs, first, sums, index."""
+    found, row_first = _find_runs(bits, width, shift)
+    number, m = _join_runs(found, row_first, 1 << shift)
+    first, sums, index = np.zeros(m + 1, np.int64), np.zeros((m, 10), np.int64), np.zeros(m)
+    sums[:, LEFT], sums[:, TOP] = width, len(bits)
+    for k in range(len(found)):
+        c, start, stop = number[k], np.int64(found[k, 0]), np.int64(found[k, 1])
+        y = start >> shift
+        left, right = start - (y << shift), stop - 1 - (y << shift)
+        n, x_sum, xx_sum, seeds, index[c] = _sum_run(start, stop, left, counts, threshold, offset, index[c])
+        sums[c, AREA] += stop - start
+        sums[c, SEEDS] += seeds
+        sums[c, COUNT] += n
+        sums[c, COUNT_X] += x_sum
+        sums[c, COUNT_Y] += n * y
+        sums[c, COUNT_RR] += xx_sum + n * y * y
+        sums[c, LEFT], sums[c, RIGHT] = min(sums[c, LEFT], left), max(sums[c, RIGHT], right)
+        sums[c, TOP], sums[c, BOTTOM] = min(sums[c, TOP], y), max(sums[c, BOTTOM], y)
+        first[c + 1] += 1
+        for p in range(start, stop):
+            label[p] = c + 1
+    for c in range(m):
+        first[c + 1] += first[c]
+        index[c] /= sums[c, AREA]
+    end = first.copy()
+    run = np.empty_like(found)
+    for k in range(len(found)):
+        at = end[number[k]]
+        end[number[k]] += 1
+        run[at, 0], run[at, 1] = found[k, 0], found[k, 1]
+    return run, first, sums, index
+
+
+@njit(cache=True, nogil=True)
+def _sum_run(start, stop, left, counts, threshold, offset, index_sum):  # type: ignore[no-untyped-def]
+    """Return n, Σ n x, Σ n x² and the seeds of a run, and its component's index sum with the run's."""
+    n_sum = x_sum = xx_sum = np.int64(0)
+    seeds = 0
+    for p in range(start, stop):
+        off, on = np.int64(counts[0, p]), np.int64(counts[1, p])
+        n, base = on + off, offset + abs(on - off)
+        x = left + p - start
+        n_sum += n
+        x_sum += n * x
+        xx_sum += n * x * x
+        seeds += n >= threshold * base
+        index_sum += n / base
+    return n_sum, x_sum, xx_sum, seeds, index_sum

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from beacon_comm.core.blobs import Blob, BlobFinder
 from beacon_comm.core.event_buffer import EventBuffer, buffer_length_ns
 from beacon_comm.core.events import EventBatch
+from beacon_comm.core.hop_events import BAND_SHIFT, CODE_BITS, ON, ROUTED
 from beacon_comm.core.index_image import IndexImages, hop_length_ns
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.routing import Routed, Router
@@ -192,12 +193,14 @@ class Detector:
             if not wanted.any():
                 continue
             parts = [
-                _events_on(events.word, events.t_ns, self._sensor_size[0], self._blobs.owner, wanted)
+                _events_on(
+                    events.code, events.offset_ns, events.first, events.t_start_ns, self._blobs.owner, wanted
+                )
                 for events in self._images.hop_events(window)
                 if len(events)
             ]
             number, t_ns, polarity = (np.concatenate(column) for column in zip(*parts, strict=True))
-            order = np.argsort(number, kind='stable')
+            order = np.lexsort((t_ns, number))
             ends = np.cumsum(np.bincount(number, minlength=len(wanted)))
             for b in np.flatnonzero(wanted):
                 of = order[ends[b - 1] : ends[b]]
@@ -205,21 +208,20 @@ class Detector:
 
 
 @njit(cache=True, nogil=True)
-def _events_on(word, t_ns, width, owner, wanted):  # type: ignore[no-untyped-def]
+def _events_on(code, offset_ns, band_first, t_start_ns, owner, wanted):  # type: ignore[no-untyped-def]
     """Return blob number, time and polarity of the events that no track got and that lie on a wanted blob."""
-    number = np.empty(len(word), np.int32)
-    of_t_ns = np.empty(len(word), np.int64)
-    polarity = np.empty(len(word), np.int8)
+    number = np.empty(len(code), np.int32)
+    t_ns = np.empty(len(code), np.int64)
+    polarity = np.empty(len(code), np.int8)
     n = 0
-    for i in range(len(word)):
-        if word[i] & 2:
-            continue
-        x = np.int64((word[i] >> 2) & 0x3FFF)
-        y = np.int64(word[i] >> 16)
-        b = owner[y * width + x]
-        if b > 0 and wanted[b]:
-            number[n] = b
-            of_t_ns[n] = t_ns[i]
-            polarity[n] = 1 if word[i] & 1 else -1
-            n += 1
-    return number[:n], of_t_ns[:n], polarity[:n]
+    for band in range(len(band_first) - 1):
+        start = band << BAND_SHIFT
+        for i in range(band_first[band], band_first[band + 1]):
+            c = np.int64(code[i])
+            b = owner[start + (c >> CODE_BITS)]
+            if b > 0 and wanted[b] and not c & ROUTED:
+                number[n] = b
+                t_ns[n] = t_start_ns + np.int64(offset_ns[i])
+                polarity[n] = 1 if c & ON else -1
+                n += 1
+    return number[:n], t_ns[:n], polarity[:n]

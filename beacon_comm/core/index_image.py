@@ -11,15 +11,16 @@ All windows lie on one grid of hops that is absolute in event time and end at th
     long               '-------------------------------'     long_window_bits of the slowest bit rate
     short                              '---------------'     short_window_s
 
-A window is kept as one count image, ON and OFF events apart, flat, pixel after pixel:
+A window is kept as one count image, OFF events, then ON events, pixel after pixel (:mod:`.hop_events` numbers them):
 
-    counts  int32   [on off | on off | on off | …]   index 2 (y width + x) + on      n = on + off, Σσ = on - off
+    counts  uint16  [off … off | on … on]       n = on + off, Σσ = on - off
 
-A hop adds its events and subtracts those of the hop that leaves: its cost is that of the events that come and go.
-A pixel's index changes with its events alone, so these also tell which pixels have come above the lower threshold
-(index_grow_share × index_threshold): they are listed, and no image is ever searched.  An event in the ring is
+A hop adds its events and subtracts those of the hop that leaves, band by band, and looks in the bands that had any
+for the pixels above the lower threshold (index_grow_share × index_threshold): its cost is that of the events that
+come and go, until all bands have some.  These pixels are one bit each, 64 to a word, as the next stage takes them.
 
-    word    uint32  [ y: 16 bits | x: 14 bits | routed | on ]      and its time, int64 ns
+A count ends at 16,383: further events of that pixel and polarity are not counted, and flagged, so that they are not
+subtracted either.
 """
 
 from __future__ import annotations
@@ -34,33 +35,16 @@ from numba import njit
 from numpy.typing import NDArray
 
 from beacon_comm.core.events import NS_PER_S
+from beacon_comm.core.hop_events import BAND_SHIFT, CODE_BITS, ON, HopEvents, PixelGrid, no_events
 from beacon_comm.core.parameters import Parameters
 
-MAX_WIDTH = 1 << 14
-MAX_HEIGHT = 1 << 16
-
-
-@dataclass(frozen=True, slots=True)
-class HopEvents:
-    """The events of one hop, in order of time.
-
-    Attributes:
-        word: packed pixel, routed flag and polarity, ``(n,)`` uint32; see the module's head.
-        t_ns: sensor time (ns), ``(n,)`` int64.
-    """
-
-    word: NDArray[np.uint32]
-    t_ns: NDArray[np.int64]
-
-    def __len__(self) -> int:
-        return len(self.word)
-
-    @property
-    def size_bytes(self) -> int:
-        return int(self.word.nbytes + self.t_ns.nbytes)
-
-
-NO_EVENTS = HopEvents(np.empty(0, np.uint32), np.empty(0, np.int64))
+MOST_COUNTED = (1 << 14) - 1
+_NOT_COUNTED = 4  # flag of the short window; the long one's is the next bit
+WORD_SHIFT = 6  # 64 pixels a word of bits
+_WORD = 1 << WORD_SHIFT
+_EACH = np.uint64(0x0001_0001_0001_0001)
+_UPPER = np.uint64(0x8000_8000_8000_8000)
+_GATHER = np.uint64(0x0102_0408_1020_4080)  # times eight bytes of 0 or 1: the upper byte has them as bits
 
 
 @dataclass(slots=True)
@@ -69,19 +53,16 @@ class Window:
 
     Attributes:
         hops: its length.
-        counts: ON and OFF events of every pixel, ``(2 height width,)`` int32; see the module's head.
-        mark: whether a pixel is listed, ``(height width,)`` uint8.
-        pixel: numbers y width + x of the listed pixels, ``(height width,)`` int32, the first ``listed`` are valid;
-            every pixel above the lower threshold is among them.
-        listed: how many.
+        counts: OFF, then ON events of every pixel, ``(2, numbers)`` uint16; see the module's head.
+        low: whether a pixel is above the lower threshold, ``(height, stride / 64)`` uint64, bit x % 64 of word x / 64.
+        flag: marks the events that are not counted in it.
         events: events in the window.
     """
 
     hops: int
-    counts: NDArray[np.int32]
-    mark: NDArray[np.uint8]
-    pixel: NDArray[np.int32]
-    listed: int = 0
+    counts: NDArray[np.uint16]
+    low: NDArray[np.uint64]
+    flag: int
     events: int = 0
 
 
@@ -94,27 +75,29 @@ class IndexImages:
         sensor_size: width and height (px).
 
     Attributes:
+        grid: how pixels are numbered.
         windows: the short window, then the long one unless it is no longer than the short one.
         overflow_events: events dropped from the windows because the ring reached ``window_max_bytes``.
     """
 
     def __init__(self, parameters: Parameters, sensor_size: tuple[int, int]) -> None:
-        self.width, self.height = sensor_size
-        if not (0 < self.width <= MAX_WIDTH and 0 < self.height <= MAX_HEIGHT):
-            raise ValueError(f'sensor_size = {sensor_size}: must lie in [1, {MAX_WIDTH}] x [1, {MAX_HEIGHT}] px')
+        self.grid = PixelGrid(*sensor_size)
         self._max_bytes = parameters.window_max_bytes
         self._offset = parameters.index_offset
         self._low = parameters.index_threshold * parameters.index_grow_share
         short = whole_hops(parameters.short_window_s, parameters.hop_s)
         long = whole_hops(parameters.long_window_bits * parameters.slowest_bit_s, parameters.hop_s)
-        self.windows = [self._empty_window(hops) for hops in ((short, long) if long > short else (short,))]
-        self._ring: deque[HopEvents] = deque([NO_EVENTS] * self.windows[-1].hops, maxlen=self.windows[-1].hops)
+        lengths = (short, long) if long > short else (short,)
+        self.windows = [self._empty_window(hops, _NOT_COUNTED << k) for k, hops in enumerate(lengths)]
+        self._none = no_events(self.grid.bands)
+        self._ring: deque[HopEvents] = deque([self._none] * self.windows[-1].hops, maxlen=self.windows[-1].hops)
         self._ring_bytes = 0
         self.overflow_events = 0
 
-    def _empty_window(self, hops: int) -> Window:
-        size = self.width * self.height
-        return Window(hops, np.zeros(2 * size, np.int32), np.zeros(size, np.uint8), np.empty(size, np.int32))
+    def _empty_window(self, hops: int, flag: int) -> Window:
+        counts = np.zeros((2, self.grid.numbers), np.uint16)
+        low = np.zeros((self.grid.height, self.grid.stride >> WORD_SHIFT), np.uint64)
+        return Window(hops, counts, low, flag)
 
     @property
     def empty(self) -> bool:
@@ -133,9 +116,7 @@ class IndexImages:
     def push(self, events: HopEvents) -> None:
         """Move every window on by one hop that held ``events``."""
         for window in self.windows:
-            leaving = self._ring[-window.hops]
-            self._count(window, leaving, -1)
-            self._count(window, events, 1)
+            self._slide(window, self._ring[-window.hops], events)
         self._ring_bytes += events.size_bytes - self._ring[0].size_bytes
         self._ring.append(events)
         if self._ring_bytes > self._max_bytes:
@@ -148,32 +129,34 @@ class IndexImages:
             events = self._ring[k]
             for window in self.windows:
                 if k >= len(self._ring) - window.hops:
-                    self._count(window, events, -1)
+                    self._slide(window, events, self._none)
             self._ring_bytes -= events.size_bytes
             self.overflow_events += len(events)
-            self._ring[k] = NO_EVENTS
+            self._ring[k] = self._none
 
-    def _count(self, window: Window, events: HopEvents, sign: int) -> None:
-        if len(events):
-            window.listed = _count(
-                events.word, sign, self.width, self._low, self._offset,
-                window.counts, window.mark, window.pixel, window.listed,
+    def _slide(self, window: Window, leaving: HopEvents, coming: HopEvents) -> None:
+        if len(leaving) or len(coming):
+            _slide(
+                leaving.code, leaving.first, coming.code, coming.first, window.flag, self._low, self._offset,
+                self.grid.width, self.grid.shift, window.counts, window.counts.view(np.uint64), window.low,
             )  # fmt: skip
-            window.events += sign * len(events)
-
-    def low_pixels(self, window: Window) -> NDArray[np.int32]:
-        """Return the numbers y width + x of the pixels above the lower threshold, each once, ``(n,)`` int32."""
-        window.listed = _still_above(
-            window.counts, self._low, self._offset, window.mark, window.pixel, window.listed
-        )
-        return window.pixel[: window.listed]
+            window.events += len(coming) - len(leaving)
 
     def index(self, window: Window) -> NDArray[np.float64]:
         """Return the index image of ``window``, ``(height, width)`` float64 (paper, section III)."""
-        on = window.counts[1::2].astype(np.float64).reshape(self.height, self.width)
-        off = window.counts[::2].astype(np.float64).reshape(self.height, self.width)
+        off, on = self.counts(window).astype(np.float64)
         index: NDArray[np.float64] = (on + off) / (self._offset + np.abs(on - off))
         return index
+
+    def counts(self, window: Window) -> NDArray[np.uint16]:
+        """Return the OFF, then the ON events of the sensor's pixels, ``(2, height, width)`` uint16."""
+        rows = window.counts.reshape(2, -1, self.grid.stride)
+        return rows[:, : self.grid.height, : self.grid.width]
+
+    def low_pixels(self, window: Window) -> NDArray[np.bool_]:
+        """Return which pixels are above the lower threshold, ``(height, width)`` bool."""
+        bits = np.unpackbits(window.low.astype('<u8').view(np.uint8), axis=1, bitorder='little')
+        return bits[:, : self.grid.width].astype(np.bool_)
 
 
 def whole_hops(window_s: float, hop_s: float) -> int:
@@ -187,34 +170,75 @@ def hop_length_ns(parameters: Parameters) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _count(word, sign, width, low, offset, counts, mark, pixel, listed):  # type: ignore[no-untyped-def]
-    """Add ``sign`` to each event's count, list the pixels that are above the lower threshold then.
-
-    A subtraction can bring a pixel above it, too: when it takes from the polarity there is more of.
-    """
-    fewest = max(1.0, np.ceil(low * offset))
-    for i in range(len(word)):
-        x = np.int64((word[i] >> 2) & 0x3FFF)
-        p = np.int64(word[i] >> 16) * width + x
-        counts[2 * p + np.int64(word[i] & 1)] += sign
-        n = counts[2 * p] + counts[2 * p + 1]
-        if n >= fewest and not mark[p] and n >= low * (offset + abs(counts[2 * p + 1] - counts[2 * p])):
-            mark[p] = 1
-            pixel[listed] = p
-            listed += 1
-    return listed
+def _slide(  # type: ignore[no-untyped-def]
+    leaving, leaving_first, coming, coming_first, flag, low, offset, width, shift, counts, packed, low_bits,
+):  # fmt: skip
+    """Take the leaving events off the counts and add the coming ones, band by band; find the low pixels again."""
+    fewest = np.uint64(min(max(1.0, np.ceil(low * offset)), 2.0 * MOST_COUNTED + 1.0))
+    rows = 1 << (BAND_SHIFT - shift)
+    for band in range(len(coming_first) - 1):
+        gone = leaving[leaving_first[band] : leaving_first[band + 1]]
+        came = coming[coming_first[band] : coming_first[band + 1]]
+        if len(gone) == 0 and len(came) == 0:
+            continue
+        start = band << BAND_SHIFT
+        _subtract(gone, start, flag, counts)
+        _add(came, start, flag, counts)
+        for row in range(band * rows, min((band + 1) * rows, len(low_bits))):
+            _find_low(counts, packed, row << shift, width, fewest, low, offset, low_bits[row])
 
 
 @njit(cache=True, nogil=True)
-def _still_above(counts, low, offset, mark, pixel, listed):  # type: ignore[no-untyped-def]
-    """Strike the pixels off the list that are no longer above the lower threshold; return how many stay."""
-    stay = 0
-    for i in range(listed):
-        p = pixel[i]
-        n = counts[2 * p] + counts[2 * p + 1]
-        if n > 0 and n >= low * (offset + abs(counts[2 * p + 1] - counts[2 * p])):
-            pixel[stay] = p
-            stay += 1
+def _place(code, start, numbers):  # type: ignore[no-untyped-def]
+    """Return where an event of the band that begins at pixel ``start`` is counted, in all the counts on end."""
+    # Unsigned, so that no place is taken to count from the end.
+    return np.uint64(code & ON) * np.uint64(numbers) + np.uint64(start) + np.uint64(code >> CODE_BITS)
+
+
+@njit(cache=True, nogil=True)
+def _subtract(code, start, flag, counts):  # type: ignore[no-untyped-def]
+    """Take events off the counts of the band that begins at pixel ``start``."""
+    numbers, flat = counts.shape[1], counts.ravel()
+    for i in range(len(code)):
+        if not code[i] & flag:
+            flat[_place(code[i], start, numbers)] -= np.uint16(1)
+
+
+@njit(cache=True, nogil=True)
+def _add(code, start, flag, counts):  # type: ignore[no-untyped-def]
+    """Count events of the band that begins at pixel ``start``; flag those that a full count does not hold."""
+    numbers, flat = counts.shape[1], counts.ravel()
+    for i in range(len(code)):
+        place = _place(code[i], start, numbers)
+        if flat[place] < MOST_COUNTED:
+            flat[place] += np.uint16(1)
         else:
-            mark[p] = 0
-    return stay
+            code[i] |= np.uint16(flag)
+
+
+@njit(cache=True, nogil=True)
+def _find_low(counts, packed, start, width, fewest, low, offset, bits):  # type: ignore[no-untyped-def]
+    """Set the bits of the low pixels of the row that begins at pixel ``start``.
+
+    A word of which no pixel has the fewest events is passed over at once.  Four pixels are looked at in one 64-bit
+    number: their n is below 2¹⁵, and adding 2¹⁵ - fewest sets the upper bit of those with enough.
+    """
+    enough = (np.uint64(1 << 15) - fewest) * _EACH
+    is_low = np.empty(_WORD, np.uint8)
+    eight = is_low.view(np.uint64)
+    for word in range(((width - 1) >> WORD_SHIFT) + 1):
+        pixel = start + (word << WORD_SHIFT)
+        four = slice(pixel >> 2, (pixel + _WORD) >> 2)
+        packed_off, packed_on = packed[0, four], packed[1, four]
+        some = np.uint64(0)
+        for k in range(_WORD >> 2):
+            some |= packed_off[k] + packed_on[k] + enough
+        found = np.uint64(0)
+        if some & _UPPER:
+            off, on = counts[0, pixel : pixel + _WORD], counts[1, pixel : pixel + _WORD]
+            for k in range(_WORD):
+                n, difference = np.int32(off[k]) + np.int32(on[k]), abs(np.int32(on[k]) - np.int32(off[k]))
+                is_low[k] = (n > 0) & (n >= low * (offset + difference))
+            for k in range(8):
+                found |= ((eight[k] * _GATHER) >> np.uint64(56)) << np.uint64(8 * k)
+        bits[word] = found

@@ -20,7 +20,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from beacon_comm.core.events import EventBatch
-from beacon_comm.core.index_image import HopEvents, hop_length_ns
+from beacon_comm.core.hop_events import CODE_BITS, ROUTED, HopEvents, PixelGrid, sorted_by_band
+from beacon_comm.core.index_image import hop_length_ns
 from beacon_comm.core.nearest import CELL_SHIFT, cell_lists, cells_along
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.tracks import Track, positions_at
@@ -55,11 +56,12 @@ class Router:
     """
 
     def __init__(self, parameters: Parameters, sensor_size: tuple[int, int]) -> None:
-        self._width, self._height = sensor_size
+        self._grid = PixelGrid(*sensor_size)
         self._hop_ns = hop_length_ns(parameters)
         self._factor, self._margin = parameters.routing_extent_factor, parameters.routing_margin_px
-        self._word = np.empty(_FIRST_ROOM, np.uint32)
-        self._t_ns = np.empty(_FIRST_ROOM, np.int64)
+        self._word, self._offset_ns = np.empty(_FIRST_ROOM, np.uint32), np.empty(_FIRST_ROOM, np.uint32)
+        self._index, self._owner = np.empty(_FIRST_ROOM, np.int32), np.empty(_FIRST_ROOM, np.int32)
+        self._in_band = np.zeros(self._grid.bands, np.int64)
         self._gathered = 0
         self.outside_events = 0
         self.aim((), 0)
@@ -79,92 +81,138 @@ class Router:
         low, high = np.minimum(now, then) - radius[:, None], np.maximum(now, then) + radius[:, None]
         box = np.column_stack((low[:, 0], high[:, 0], low[:, 1], high[:, 1]))
         self._circle = circle
-        self._first, self._member = cell_lists(box, self._width, self._height)
+        self._first, self._member = cell_lists(box, self._grid.width, self._grid.height)
 
     def route(self, segment: EventBatch) -> list[Routed]:
         """Return the events of each track that got any, in order of the tracks' labels."""
-        n = len(segment)
-        if n == 0:
+        if len(segment) == 0:
             return []
-        if self._gathered + n > len(self._word):
+        segment = self._on_sensor(segment)
+        n, start = len(segment), self._gathered
+        if start + n > len(self._word):
             self._make_room(n)
-        owner = np.empty(n, np.int32)
-        first = np.zeros(len(self._track_ids) + 2, np.int64)
-        kept = _route(
-            segment.x, segment.y, segment.polarity, segment.t_ns, self._width, self._height, self._t_hop_ns,
-            self._circle, self._first, self._member, cells_along(self._width),
-            self._word[self._gathered :], self._t_ns[self._gathered :], owner, first,
+        self._gathered += n
+        word = self._word[start : start + n]
+        _pack(
+            segment.x, segment.y, segment.polarity, segment.t_ns, self._grid.shift, self._t_hop_ns,
+            word, self._offset_ns[start : start + n],
         )  # fmt: skip
-        self._gathered += kept
-        self.outside_events += n - kept
-        if first[-1] == 0:
+        _count_bands(word, self._in_band)
+        return self._own(segment, word) if self._track_ids else []
+
+    def _on_sensor(self, segment: EventBatch) -> EventBatch:
+        """Return the segment without the events beyond the sensor's borders."""
+        width, height = self._grid.width, self._grid.height
+        outside = _count_outside(segment.x, segment.y, width, height)
+        if outside == 0:
+            return segment
+        self.outside_events += outside
+        kept = (segment.x < width) & (segment.y < height)
+        return EventBatch(
+            segment.x[kept], segment.y[kept], segment.polarity[kept], segment.t_ns[kept], segment.t_end_ns
+        )
+
+    def _own(self, segment: EventBatch, word: NDArray[np.uint32]) -> list[Routed]:
+        """Return each track's events, and flag them in ``word``."""
+        count = np.zeros(len(self._track_ids) + 1, np.int64)
+        routed = _find_owners(
+            segment.x, segment.y, segment.t_ns, self._t_hop_ns, self._circle, self._first, self._member,
+            cells_along(self._grid.width), self._index, self._owner, word, count[1:],
+        )  # fmt: skip
+        if routed == 0:
             return []
-        t_ns, polarity = np.empty(first[-1], np.int64), np.empty(first[-1], np.int8)
-        _sort(owner, segment.t_ns, segment.polarity, first, t_ns, polarity)
-        ends = first.tolist()  # after sorting: where each track's events end
+        t_ns, polarity = np.empty(routed, np.int64), np.empty(routed, np.int8)
+        ends = np.cumsum(count)  # and the end of all, behind the last track's begin
+        _sort(self._index[:routed], self._owner, segment.t_ns, segment.polarity, ends, t_ns, polarity)
+        stops = ends.tolist()  # after sorting: where each track's events end
         return [
             Routed(track_id, t_ns[start:stop], polarity[start:stop])
-            for track_id, start, stop in zip(self._track_ids, [0, *ends], ends, strict=False)
+            for track_id, start, stop in zip(self._track_ids, [0, *stops], stops, strict=False)
             if stop > start
         ]
 
     def close(self) -> HopEvents:
         """Return the events gathered in the hop interval, and begin the next one."""
         n, self._gathered = self._gathered, 0
-        return HopEvents(self._word[:n].copy(), self._t_ns[:n].copy())
+        events = sorted_by_band(self._word[:n], self._offset_ns[:n], self._in_band, self._t_hop_ns)
+        self._in_band[:] = 0
+        return events
 
     def _make_room(self, n: int) -> None:
         room = 2 * (self._gathered + n)
-        word, t_ns, kept = self._word, self._t_ns, self._gathered
-        self._word, self._t_ns = np.empty(room, np.uint32), np.empty(room, np.int64)
-        self._word[:kept], self._t_ns[:kept] = word[:kept], t_ns[:kept]
+        word, offset_ns, kept = self._word, self._offset_ns, self._gathered
+        self._word, self._offset_ns = np.empty(room, np.uint32), np.empty(room, np.uint32)
+        self._index, self._owner = np.empty(room, np.int32), np.empty(room, np.int32)
+        self._word[:kept], self._offset_ns[:kept] = word[:kept], offset_ns[:kept]
 
 
 @njit(cache=True, nogil=True)
-def _route(  # type: ignore[no-untyped-def]
-    x, y, polarity, t_ns, width, height, t_hop_ns, circle, first, member, cells_across,
-    word, gathered_t_ns, owner, count,
-):  # fmt: skip
-    """Find each event's track, -1 for none; gather it; count the events of track k in ``count[k + 1]``.
-
-    ``count[-1]`` is the number of all routed events.  Returns how many events lie on the sensor.
-    """
-    kept = 0
-    for i in range(len(t_ns)):
-        ex, ey = np.int64(x[i]), np.int64(y[i])
-        best = -1
-        if ex < width and ey < height:
-            cell = (ey >> CELL_SHIFT) * cells_across + (ex >> CELL_SHIFT)
-            nearest2 = np.inf
-            for j in range(first[cell], first[cell + 1]):
-                k = member[j]
-                dt = t_ns[i] - t_hop_ns
-                dx = ex - (circle[k, 0] + circle[k, 2] * dt)
-                dy = ey - (circle[k, 1] + circle[k, 3] * dt)
-                d2 = dx * dx + dy * dy
-                if d2 <= circle[k, 4] ** 2 and d2 < nearest2:
-                    nearest2 = d2
-                    best = k
-            routed = np.uint32(2) if best >= 0 else np.uint32(0)
-            on = np.uint32(1) if polarity[i] > 0 else np.uint32(0)
-            word[kept] = np.uint32((ey << 16) | (ex << 2)) | routed | on
-            gathered_t_ns[kept] = t_ns[i]
-            kept += 1
-        owner[i] = best
-        if best >= 0:
-            count[best + 1] += 1
-            count[-1] += 1
-    return kept
+def _count_outside(x, y, width, height):  # type: ignore[no-untyped-def]
+    outside = 0
+    for i in range(len(x)):
+        outside += (x[i] >= width) | (y[i] >= height)
+    return outside
 
 
 @njit(cache=True, nogil=True)
-def _sort(owner, t_ns, polarity, first, sorted_t_ns, sorted_polarity):  # type: ignore[no-untyped-def]
-    """Sort the routed events by track; ``first`` begins as counts and ends as where each track's events end."""
-    for k in range(1, len(first) - 1):
-        first[k] += first[k - 1]
-    for i in range(len(owner)):
-        k = owner[i]
+def _pack(x, y, polarity, t_ns, shift, t_hop_ns, word, offset_ns):  # type: ignore[no-untyped-def]
+    """Write each event's word, and its time since the hop's begin."""
+    for i in range(len(x)):
+        pixel = (np.uint32(y[i]) << np.uint32(shift)) | np.uint32(x[i])
+        word[i] = (pixel << np.uint32(CODE_BITS)) | np.uint32(polarity[i] > 0)
+        offset_ns[i] = t_ns[i] - t_hop_ns
+
+
+@njit(cache=True, nogil=True)
+def _count_bands(word, in_band):  # type: ignore[no-untyped-def]
+    for i in range(len(word)):
+        in_band[word[i] >> np.uint32(16)] += 1
+
+
+@njit(cache=True, nogil=True)
+def _find_owners(  # type: ignore[no-untyped-def]
+    x, y, t_ns, t_hop_ns, circle, first, member, cells_across, index, owner, word, count
+):
+    """List the events that are of a track, with their tracks, and count them by track; return how many."""
+    near = np.uint64(0)
+    for i in range(len(x)):
+        cell = np.uint64(y[i] >> CELL_SHIFT) * np.uint64(cells_across) + np.uint64(x[i] >> CELL_SHIFT)
+        index[near] = i
+        near += np.uint64(first[cell] != first[cell + np.uint64(1)])
+    routed = 0
+    for j in range(near):
+        i = index[j]
+        cell = np.int64(y[i] >> CELL_SHIFT) * cells_across + np.int64(x[i] >> CELL_SHIFT)
+        k = _nearest(x[i], y[i], t_ns[i] - t_hop_ns, circle, member[first[cell] : first[cell + 1]])
         if k >= 0:
-            sorted_t_ns[first[k]] = t_ns[i]
-            sorted_polarity[first[k]] = polarity[i]
-            first[k] += 1
+            word[i] |= np.uint32(ROUTED)
+            index[routed] = i
+            owner[routed] = k
+            count[k] += 1
+            routed += 1
+    return routed
+
+
+@njit(cache=True, nogil=True)
+def _nearest(x, y, dt_ns, circle, among):  # type: ignore[no-untyped-def]
+    """Return the nearest of the circles that hold an event, -1 if none does; the first one of equals."""
+    nearest2 = np.inf
+    best = -1
+    for k in among:
+        dx = x - (circle[k, 0] + circle[k, 2] * dt_ns)
+        dy = y - (circle[k, 1] + circle[k, 3] * dt_ns)
+        d2 = dx * dx + dy * dy
+        if d2 <= circle[k, 4] ** 2 and d2 < nearest2:
+            nearest2 = d2
+            best = k
+    return best
+
+
+@njit(cache=True, nogil=True)
+def _sort(index, owner, t_ns, polarity, end, sorted_t_ns, sorted_polarity):  # type: ignore[no-untyped-def]
+    """Sort the routed events by track; ``end`` begins as where each track's events begin and ends as where they end."""
+    for i in range(len(index)):
+        at = end[owner[i]]
+        end[owner[i]] = at + 1
+        sorted_t_ns[at] = t_ns[index[i]]
+        sorted_polarity[at] = polarity[index[i]]

@@ -64,6 +64,10 @@ STEP_BACK_US = 1_000_000
 """Up to here a fall of TIME_HIGH is a step back, and a wrap may differ from host time."""
 _VECTOR_MARGIN = 12
 """A vector writes all its columns and then counts those that are events: room behind the last one."""
+_SIGN_SHIFT, _LATE_SHIFT = 12, 13
+_COLUMNS = 1 << _SIGN_SHIFT
+"""No sensor is wider than this."""
+_COLUMN = _COLUMNS - 1
 
 # State from packet to packet.
 _HIGH_US, _LOW_US, _TIMED, _ROW, _BASE, _POLARITY, _LATEST_US = range(7)
@@ -71,7 +75,7 @@ _STATE_SIZE = 7
 _UNKNOWN = -1
 _NO_BITS, _HIGH_BITS, _ALL_BITS = range(3)
 """What of the time was seen since the start, or since packets were missing."""
-_NO_ROW = 1 << 16
+_NO_ROW = 0xFFFF  # no sensor has it: such events are outside at first
 _NO_BASE = 1 << 40
 # How a packet follows the one before; whether it had a TIME_HIGH yet; whether that told of a restart.
 _ELAPSED_US, _SEQ_FELL, _FOLLOWED, _RESTARTED = range(4)
@@ -213,56 +217,79 @@ def _count_other(code, word, tally):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _spread(  # type: ignore[no-untyped-def]
-    word, columns, base, row, sign, now_ns, width, height, x, y, polarity, t_ns, n, tally
-):
-    """Write a vector's events behind the first ``n``; return the new number."""
-    bits = 0
-    start = n
+def _spread(word, columns, base, row, sign_bit, now_ns, late, x, y, t_ns, n, tally):  # type: ignore[no-untyped-def]
+    """List a vector's events behind the first ``n``; return the new number."""
+    if base + columns > _COLUMNS:  # no sensor has them: count what is set beyond
+        beyond = max(_COLUMNS - base, 0)
+        kind = OUTSIDE if row != _NO_ROW and base < _NO_BASE else UNDECODED
+        for k in range(beyond, columns):
+            tally[kind] += (word >> k) & 1
+        columns = beyond
     for k in range(columns):
-        bit = (word >> k) & 1
-        x[n] = base + k
+        x[n] = (base + k) | sign_bit | late
         y[n] = row
-        polarity[n] = sign
         t_ns[n] = now_ns
-        bits += bit
-        n += bit & (base + k < width) & (row < height)
-    if n - start < bits:
-        known = row != _NO_ROW and base < _NO_BASE
-        tally[OUTSIDE if known else UNDECODED] += bits - (n - start)
+        n += np.uint64((word >> k) & 1)
     return n
 
 
 @njit(cache=True, nogil=True)
+def _settle(n, width, height, x, y, polarity, t_ns, tally):  # type: ignore[no-untyped-def]
+    """Take the listed events' columns apart and drop those outside the sensor; return how many stay."""
+    inside = late = 0
+    for k in range(n):
+        listed = np.int32(x[k])
+        kept = ((listed & _COLUMN) < width) & (y[k] < height)
+        inside += kept
+        late += kept & (listed >> _LATE_SHIFT)
+        polarity[k] = ((listed >> (_SIGN_SHIFT - 1)) & 2) - 1
+        x[k] = listed & _COLUMN
+    tally[CLAMPED] += late
+    if inside == n:
+        return inside
+    stay = 0
+    for k in range(n):
+        if x[k] < width and y[k] < height:
+            x[stay], y[stay], polarity[stay], t_ns[stay] = x[k], y[k], polarity[k], t_ns[k]
+            stay += 1
+        else:
+            tally[UNDECODED if y[k] == _NO_ROW else OUTSIDE] += 1
+    return stay
+
+
+@njit(cache=True, nogil=True)
 def _decode(words, width, height, state, link, x, y, polarity, t_ns, tally):  # type: ignore[no-untyped-def]
-    """Decode a packet's words into the columns; return the number of events."""
+    """Decode a packet's words into the columns; return the number of events.
+
+    First the events are listed as the words have them, with the row and the time that hold: a handful of operations a
+    word.  What can be done to all at once comes after that (:func:`_settle`).  Until then a place of ``x`` holds
+
+        13    late: time has stepped back      12    sign      11…0    column
+    """
     i = _await_time(words, 0, state, link, tally) if state[_TIMED] != _ALL_BITS else 0
     high_us, low_us, latest_us = state[_HIGH_US], state[_LOW_US], state[_LATEST_US]
-    row, base, sign = state[_ROW], state[_BASE], state[_POLARITY]
-    now_us = high_us + low_us
+    row, base, sign = np.uint16(state[_ROW]), state[_BASE], state[_POLARITY]
+    late = np.int64(high_us + low_us < latest_us) << _LATE_SHIFT
+    now_ns = latest_us * 1000
     same_high = TIME_HIGH << 12 | ((high_us >> 12) & 0xFFF)
-    n = 0
-    while i < len(words):
-        word = np.int64(words[i])
-        i += 1
+    n = np.uint64(0)  # unsigned, so that no place is taken to count from the end
+    at, end = np.uint64(i), np.uint64(len(words))
+    while at < end:
+        word = np.int64(words[at])
+        at += np.uint64(1)
         code = word >> 12
         if code == ADDR_X:
-            column = word & 0x7FF
-            if column < width and row < height:
-                x[n] = column
-                y[n] = row
-                polarity[n] = ((word >> 10) & 2) - 1
-                t_ns[n] = latest_us * 1000
-                tally[CLAMPED] += now_us < latest_us
-                n += 1
-            else:
-                tally[UNDECODED if row == _NO_ROW else OUTSIDE] += 1
+            x[n] = (word & 0x7FF) | ((word & 0x800) << (_SIGN_SHIFT - 11)) | late
+            y[n] = row
+            t_ns[n] = now_ns
+            n += np.uint64(1)
         elif code == ADDR_Y:
-            row = word & 0x7FF
+            row = np.uint16(word & 0x7FF)
         elif code == TIME_LOW:
             low_us = word & 0xFFF
-            now_us = high_us + low_us
-            latest_us = max(latest_us, now_us)
+            late = np.int64(high_us + low_us < latest_us) << _LATE_SHIFT
+            latest_us = max(latest_us, high_us + low_us)
+            now_ns = latest_us * 1000
         elif word == same_high:
             link[_FOLLOWED] = 1
         elif code == TIME_HIGH:
@@ -270,23 +297,23 @@ def _decode(words, width, height, state, link, x, y, polarity, t_ns, tally):  # 
             link[_FOLLOWED] = 1
             if restarted:
                 # What came before belongs to the sensor's life before; so does the state.
-                tally[UNDECODED] += n
-                n = 0
+                before = _settle(n, width, height, x, y, polarity, t_ns, tally)
+                tally[UNDECODED] += before
+                n = np.uint64(0)
                 _start_anew(state, link)
-                i = _await_time(words, i - 1, state, link, tally)
+                at = np.uint64(_await_time(words, np.int64(at) - 1, state, link, tally))
                 high_us, low_us, latest_us = state[_HIGH_US], state[_LOW_US], state[_LATEST_US]
-                row, base, sign = state[_ROW], state[_BASE], state[_POLARITY]
+                row, base, sign = np.uint16(state[_ROW]), state[_BASE], state[_POLARITY]
             else:
                 low_us = np.int64(0)
-            now_us = high_us + low_us
-            latest_us = max(latest_us, now_us)
+            late = np.int64(high_us + low_us < latest_us) << _LATE_SHIFT
+            latest_us = max(latest_us, high_us + low_us)
+            now_ns = latest_us * 1000
             same_high = TIME_HIGH << 12 | ((high_us >> 12) & 0xFFF)
         elif code in (VECT_12, VECT_8):
             columns = 12 if code == VECT_12 else 8
-            now_ns = latest_us * 1000
-            end = _spread(word, columns, base, row, sign, now_ns, width, height, x, y, polarity, t_ns, n, tally)
-            tally[CLAMPED] += (end - n) * (now_us < latest_us)
-            n = end
+            sign_bit = np.int64(sign > 0) << _SIGN_SHIFT
+            n = _spread(word, columns, base, row, sign_bit, now_ns, late, x, y, t_ns, n, tally)
             base += columns
         elif code == VECT_BASE_X:
             base = word & 0x7FF
@@ -295,4 +322,4 @@ def _decode(words, width, height, state, link, x, y, polarity, t_ns, tally):  # 
             _count_other(code, word, tally)
     state[_HIGH_US], state[_LOW_US], state[_LATEST_US] = high_us, low_us, latest_us
     state[_ROW], state[_BASE], state[_POLARITY] = row, base, sign
-    return n
+    return _settle(n, width, height, x, y, polarity, t_ns, tally)
