@@ -186,7 +186,7 @@ class BlobFinder:
             axis=1,
         )
         first, member = cell_lists(box, width, height)
-        circle = np.stack((x, y, radius), axis=1)
+        circle = np.stack((x, y, radius**2), axis=1)
         summed: NDArray[np.int64] = _sum_newest(
             newest.code, newest.offset_ns, newest.first, self._grid.shift, cells_along(width),
             first, member, circle, self.owner,
@@ -259,18 +259,20 @@ def _sum_newest(  # type: ignore[no-untyped-def]
             p = start + (np.int64(code[i]) >> CODE_BITS)
             y = p >> shift
             x = p - (y << shift)
-            cell = (y >> CELL_SHIFT) * cells_across + (x >> CELL_SHIFT)
-            if first[cell] == first[cell + 1]:
+            cell = np.uint64((y >> CELL_SHIFT) * cells_across + (x >> CELL_SHIFT))
+            begin, end = np.uint64(first[cell]), np.uint64(first[cell + np.uint64(1)])
+            if begin == end:
                 continue
             b = np.int64(owner[p]) - 1
             if b == -1:
                 nearest2 = np.inf
-                for k in range(first[cell], first[cell + 1]):
-                    m = member[k]
-                    d2 = (x - circle[m, 0]) ** 2 + (y - circle[m, 1]) ** 2
-                    if d2 <= circle[m, 2] ** 2 and d2 < nearest2:
+                for k in range(begin, end):
+                    m = np.uint64(member[k])
+                    dx, dy = x - circle[m, 0], y - circle[m, 1]
+                    d2 = dx * dx + dy * dy
+                    if d2 <= circle[m, 2] and d2 < nearest2:
                         nearest2 = d2
-                        b = m
+                        b = np.int64(m)
             if b >= 0:
                 sums[b, 0] += 1
                 sums[b, 1] += x

@@ -20,7 +20,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from beacon_comm.core.hop_events import PixelGrid
-from beacon_comm.core.index_image import WORD_SHIFT, Window
+from beacon_comm.core.index_image import WORD_SHIFT, Window, lowest_bit
 from beacon_comm.core.parameters import Parameters
 
 # Columns of ComponentSet.sums.
@@ -28,9 +28,6 @@ AREA, SEEDS, COUNT, COUNT_X, COUNT_Y, COUNT_RR, LEFT, RIGHT, TOP, BOTTOM = range
 
 _ALL = np.uint64(0xFFFF_FFFF_FFFF_FFFF)
 _NONE = np.uint64(0)
-_DE_BRUIJN = np.uint64(0x03F7_9D71_B4CB_0A89)
-_PLACES = np.empty(64, np.int64)
-_PLACES[[(1 << k) * int(_DE_BRUIJN) % (1 << 64) >> 58 for k in range(64)]] = np.arange(64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +76,7 @@ class ComponentFinder:
     def find(self, window: Window) -> ComponentSet:
         """Return the components of ``window``; the label image is valid until the next call."""
         paint(self._run, self._label, 0)
-        bits = window.low
+        bits = window.low[: self._grid.height]
         if self._closing_px > 1:
             _close(bits, self._closing_px, self._grid.width, self._wide, self._closed)
             bits = self._closed
@@ -110,30 +107,40 @@ def _close(low, side, width, wide, closed):  # type: ignore[no-untyped-def]
     for y in range(height):
         _widen(low[y, :words], before, after, wide[y])
         wide[y, -1] &= last
-    for y in range(height):  # a row's pixels reach the rows y - before … y + after
+    for y in range(height):
+        # Set pixels of the rows y - after … y + before reach this one.
         spread[:] = _NONE
         for other in range(max(y - after, 0), min(y + before, height - 1) + 1):
             for k in range(words):
                 spread[k] |= wide[other, k]
         _narrow(spread, before, after, last, closed[y])
-    # Eroding by columns: of the rows y - before … y + after, which the rows above must not have lost yet.
     for y in range(height):
-        spread[:] = _ALL
-        for other in range(max(y - before, 0), min(y + after, height - 1) + 1):
-            for k in range(words):
-                spread[k] &= closed[other, k]
-        wide[y, :] = spread
-    closed[:, :] = wide
+        # It stays where the rows y - before … y + after are set; those above must not have lost theirs yet.
+        for k in range(words):
+            wide[y, k] = closed[y, k]
+        if _has_any(closed[y]):
+            for other in range(max(y - before, 0), min(y + after, height - 1) + 1):
+                for k in range(words):
+                    wide[y, k] &= closed[other, k]
+    for y in range(height):
+        for k in range(words):
+            closed[y, k] = wide[y, k]
+
+
+@njit(cache=True, nogil=True)
+def _has_any(row):  # type: ignore[no-untyped-def]
+    some = _NONE
+    for k in range(len(row)):
+        some |= row[k]
+    return some != _NONE
 
 
 @njit(cache=True, nogil=True)
 def _widen(row, before, after, out):  # type: ignore[no-untyped-def]
     """Dilate a row: pixel x sets x - before … x + after."""
-    some = _NONE
     for k in range(len(out)):
-        some |= row[k]
         out[k] = row[k]
-    if some:
+    if _has_any(row):
         for step in range(1, before + 1):
             for k in range(len(out)):
                 out[k] |= row[k] >> np.uint64(step)
@@ -150,13 +157,11 @@ def _widen(row, before, after, out):  # type: ignore[no-untyped-def]
 def _narrow(row, before, after, last, out):  # type: ignore[no-untyped-def]
     """Erode a row, given as a copy: pixel x stays if x - before … x + after are set or beyond the border."""
     end = len(out) - 1
-    some = _NONE
-    for k in range(len(out)):
-        some |= row[k]
+    some = _has_any(row)
     row[end] |= ~last
-    out[:] = _NONE
+    for k in range(len(out)):
+        out[k] = row[k] if some else _NONE
     if some:
-        out[:] = row
         for step in range(1, after + 1):
             for k in range(len(out)):
                 right = row[k + 1] if k < end else _ALL
@@ -169,13 +174,6 @@ def _narrow(row, before, after, last, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _lowest(bits):  # type: ignore[no-untyped-def]
-    """Return the place of the lowest set bit of a word that has one: 2ᵏ times a de Bruijn number begins with k's 6 bits."""
-    lowest = bits & (~bits + np.uint64(1))
-    return _PLACES[(lowest * _DE_BRUIJN) >> np.uint64(58)]
-
-
-@njit(cache=True, nogil=True)
 def _find_runs(bits, width, shift):  # type: ignore[no-untyped-def]
     """List the runs of all rows, ``(r, 2)`` int32 as in ComponentSet, and where each row's begin, ``(height + 1,)``."""
     height, words = len(bits), ((width - 1) >> WORD_SHIFT) + 1
@@ -183,24 +181,29 @@ def _find_runs(bits, width, shift):  # type: ignore[no-untyped-def]
     run = np.empty((1024, 2), np.int32)
     n = 0
     for y in range(height):
+        row_first[y + 1] = n
+        if not _has_any(bits[y]):
+            continue
         start = -1  # of a run that reaches the end of the word before
         for k in range(words):
             word = bits[y, k]
+            if not word and start < 0:
+                continue
             if n + 64 > len(run):
                 run = np.concatenate((run, np.empty_like(run)))
             at = (y << shift) + (k << WORD_SHIFT)
             if start >= 0:
                 if word == _ALL:
                     continue
-                place = _lowest(~word)
+                place = lowest_bit(~word)
                 run[n, 0], run[n, 1] = start, at + place
                 n += 1
                 start = -1
                 word &= ~((np.uint64(1) << np.uint64(place)) - np.uint64(1))
             while word:
-                begin = _lowest(word)
+                begin = lowest_bit(word)
                 beyond = ~(word >> np.uint64(begin))  # zeros shifted in: set
-                length = _lowest(beyond) if beyond else 64
+                length = lowest_bit(beyond) if beyond else 64
                 if begin + length >= 64:
                     start = at + begin
                     break

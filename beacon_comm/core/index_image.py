@@ -42,6 +42,9 @@ MOST_COUNTED = (1 << 14) - 1
 _NOT_COUNTED = 4  # flag of the short window; the long one's is the next bit
 WORD_SHIFT = 6  # 64 pixels a word of bits
 _WORD = 1 << WORD_SHIFT
+_DE_BRUIJN = np.uint64(0x03F7_9D71_B4CB_0A89)
+_PLACES = np.empty(64, np.int64)
+_PLACES[[(1 << k) * int(_DE_BRUIJN) % (1 << 64) >> 58 for k in range(64)]] = np.arange(64)
 _EACH = np.uint64(0x0001_0001_0001_0001)
 _UPPER = np.uint64(0x8000_8000_8000_8000)
 _GATHER = np.uint64(0x0102_0408_1020_4080)  # times eight bytes of 0 or 1: the upper byte has them as bits
@@ -54,7 +57,8 @@ class Window:
     Attributes:
         hops: its length.
         counts: OFF, then ON events of every pixel, ``(2, numbers)`` uint16; see the module's head.
-        low: whether a pixel is above the lower threshold, ``(height, stride / 64)`` uint64, bit x % 64 of word x / 64.
+        low: whether a pixel is above the lower threshold, row by row, ``(rows, stride / 64)`` uint64, bit x % 64 of
+            word x / 64; ``rows`` are those of all bands.
         flag: marks the events that are not counted in it.
         events: events in the window.
     """
@@ -96,7 +100,7 @@ class IndexImages:
 
     def _empty_window(self, hops: int, flag: int) -> Window:
         counts = np.zeros((2, self.grid.numbers), np.uint16)
-        low = np.zeros((self.grid.height, self.grid.stride >> WORD_SHIFT), np.uint64)
+        low = np.zeros((self.grid.numbers >> self.grid.shift, self.grid.stride >> WORD_SHIFT), np.uint64)
         return Window(hops, counts, low, flag)
 
     @property
@@ -138,7 +142,7 @@ class IndexImages:
         if len(leaving) or len(coming):
             _slide(
                 leaving.code, leaving.first, coming.code, coming.first, window.flag, self._low, self._offset,
-                self.grid.width, self.grid.shift, window.counts, window.counts.view(np.uint64), window.low,
+                window.counts, window.counts.view(np.uint64), window.low.reshape(-1),
             )  # fmt: skip
             window.events += len(coming) - len(leaving)
 
@@ -156,7 +160,7 @@ class IndexImages:
     def low_pixels(self, window: Window) -> NDArray[np.bool_]:
         """Return which pixels are above the lower threshold, ``(height, width)`` bool."""
         bits = np.unpackbits(window.low.astype('<u8').view(np.uint8), axis=1, bitorder='little')
-        return bits[:, : self.grid.width].astype(np.bool_)
+        return bits[: self.grid.height, : self.grid.width].astype(np.bool_)
 
 
 def whole_hops(window_s: float, hop_s: float) -> int:
@@ -171,21 +175,29 @@ def hop_length_ns(parameters: Parameters) -> int:
 
 @njit(cache=True, nogil=True)
 def _slide(  # type: ignore[no-untyped-def]
-    leaving, leaving_first, coming, coming_first, flag, low, offset, width, shift, counts, packed, low_bits,
+    leaving, leaving_first, coming, coming_first, flag, low, offset, counts, packed, low_bits
 ):  # fmt: skip
-    """Take the leaving events off the counts and add the coming ones, band by band; find the low pixels again."""
+    """Take the leaving events off the counts and add the coming ones, band by band; find the low pixels again.
+
+    A band is 64 words of 64 pixels: which of them had events is one word more.
+    """
     fewest = np.uint64(min(max(1.0, np.ceil(low * offset)), 2.0 * MOST_COUNTED + 1.0))
-    rows = 1 << (BAND_SHIFT - shift)
+    is_low = np.empty(_WORD, np.uint8)
     for band in range(len(coming_first) - 1):
         gone = leaving[leaving_first[band] : leaving_first[band + 1]]
         came = coming[coming_first[band] : coming_first[band + 1]]
-        if len(gone) == 0 and len(came) == 0:
-            continue
         start = band << BAND_SHIFT
-        _subtract(gone, start, flag, counts)
-        _add(came, start, flag, counts)
-        for row in range(band * rows, min((band + 1) * rows, len(low_bits))):
-            _find_low(counts, packed, row << shift, width, fewest, low, offset, low_bits[row])
+        touched = _subtract(gone, start, flag, counts) | _add(came, start, flag, counts)
+        while touched:
+            word = (start >> WORD_SHIFT) + lowest_bit(touched)
+            touched &= touched - np.uint64(1)
+            low_bits[word] = _find_low(counts, packed, word << WORD_SHIFT, fewest, low, offset, is_low)
+
+
+@njit(cache=True, nogil=True)
+def lowest_bit(bits):  # type: ignore[no-untyped-def]
+    """Return the place of the lowest set bit of a word that has one: 2ᵏ times a de Bruijn number begins with k's 6 bits."""
+    return _PLACES[((bits & (~bits + np.uint64(1))) * _DE_BRUIJN) >> np.uint64(58)]
 
 
 @njit(cache=True, nogil=True)
@@ -196,49 +208,58 @@ def _place(code, start, numbers):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def _word_of(code):  # type: ignore[no-untyped-def]
+    """Return the bit of the word of its band that an event is in."""
+    return np.uint64(1) << np.uint64(code >> (CODE_BITS + WORD_SHIFT))
+
+
+@njit(cache=True, nogil=True)
 def _subtract(code, start, flag, counts):  # type: ignore[no-untyped-def]
-    """Take events off the counts of the band that begins at pixel ``start``."""
+    """Take events off the counts of the band that begins at pixel ``start``; return the words they are in."""
     numbers, flat = counts.shape[1], counts.ravel()
+    touched = np.uint64(0)
     for i in range(len(code)):
         if not code[i] & flag:
             flat[_place(code[i], start, numbers)] -= np.uint16(1)
+            touched |= _word_of(code[i])
+    return touched
 
 
 @njit(cache=True, nogil=True)
 def _add(code, start, flag, counts):  # type: ignore[no-untyped-def]
     """Count events of the band that begins at pixel ``start``; flag those that a full count does not hold."""
     numbers, flat = counts.shape[1], counts.ravel()
+    touched = np.uint64(0)
     for i in range(len(code)):
         place = _place(code[i], start, numbers)
+        touched |= _word_of(code[i])
         if flat[place] < MOST_COUNTED:
             flat[place] += np.uint16(1)
         else:
             code[i] |= np.uint16(flag)
+    return touched
 
 
 @njit(cache=True, nogil=True)
-def _find_low(counts, packed, start, width, fewest, low, offset, bits):  # type: ignore[no-untyped-def]
-    """Set the bits of the low pixels of the row that begins at pixel ``start``.
+def _find_low(counts, packed, pixel, fewest, low, offset, is_low):  # type: ignore[no-untyped-def]
+    """Return the bits of the low pixels of the word that begins at ``pixel``; ``is_low`` is room for 64.
 
     A word of which no pixel has the fewest events is passed over at once.  Four pixels are looked at in one 64-bit
     number: their n is below 2¹⁵, and adding 2¹⁵ - fewest sets the upper bit of those with enough.
     """
     enough = (np.uint64(1 << 15) - fewest) * _EACH
-    is_low = np.empty(_WORD, np.uint8)
-    eight = is_low.view(np.uint64)
-    for word in range(((width - 1) >> WORD_SHIFT) + 1):
-        pixel = start + (word << WORD_SHIFT)
-        four = slice(pixel >> 2, (pixel + _WORD) >> 2)
-        packed_off, packed_on = packed[0, four], packed[1, four]
-        some = np.uint64(0)
-        for k in range(_WORD >> 2):
-            some |= packed_off[k] + packed_on[k] + enough
-        found = np.uint64(0)
-        if some & _UPPER:
-            off, on = counts[0, pixel : pixel + _WORD], counts[1, pixel : pixel + _WORD]
-            for k in range(_WORD):
-                n, difference = np.int32(off[k]) + np.int32(on[k]), abs(np.int32(on[k]) - np.int32(off[k]))
-                is_low[k] = (n > 0) & (n >= low * (offset + difference))
-            for k in range(8):
-                found |= ((eight[k] * _GATHER) >> np.uint64(56)) << np.uint64(8 * k)
-        bits[word] = found
+    four = slice(pixel >> 2, (pixel + _WORD) >> 2)
+    packed_off, packed_on = packed[0, four], packed[1, four]
+    some = np.uint64(0)
+    for k in range(_WORD >> 2):
+        some |= packed_off[k] + packed_on[k] + enough
+    found = np.uint64(0)
+    if some & _UPPER:
+        off, on = counts[0, pixel : pixel + _WORD], counts[1, pixel : pixel + _WORD]
+        for k in range(_WORD):
+            n, difference = np.int32(off[k]) + np.int32(on[k]), abs(np.int32(on[k]) - np.int32(off[k]))
+            is_low[k] = (n > 0) & (n >= low * (offset + difference))
+        eight = is_low.view(np.uint64)
+        for k in range(8):
+            found |= ((eight[k] * _GATHER) >> np.uint64(56)) << np.uint64(8 * k)
+    return found
