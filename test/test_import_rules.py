@@ -13,6 +13,7 @@ ALLOWED_ROOMS = {
     'core': set(),
     'wire': {'core'},
     'compiling': {'core', 'wire'},
+    'reference': {'core', 'wire'},
     'simulation': {'core'},
     'recordings': {'core', 'wire', 'simulation'},
     'evaluation': {'core'},

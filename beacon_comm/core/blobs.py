@@ -46,7 +46,7 @@ from beacon_comm.core.parameters import Parameters
 _FRESH_EVENTS = 4  # fewer new events say nothing about the position …
 _FRESH_SHARE = 0.1  # … nor does less than this share of its mean: a held LED in front of a moving background
 _SPREAD_EVENTS = 30  # fewer new events say nothing about the extent
-_AS_ACTIVE = 0.5  # share of the events a pixel that makes another pixel "about as active"
+AS_ACTIVE = 0.5  # share of the events a pixel that makes another pixel "about as active"
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,7 +230,7 @@ def _long_stands(run, first, fits, short_label, short_fits, short_counts):  # ty
                 else:
                     area_out += 1
                     count_out += n
-        partial = area_out > area_in and count_out * area_in >= _AS_ACTIVE * count_in * area_out
+        partial = area_out > area_in and count_out * area_in >= AS_ACTIVE * count_in * area_out
         stands[c] = area_in == 0 or partial
     for c in range(len(fits)):
         if stands[c]:
