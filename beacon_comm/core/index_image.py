@@ -182,16 +182,24 @@ def _slide(  # type: ignore[no-untyped-def]
     A band is 64 words of 64 pixels: which of them had events is one word more.
     """
     fewest = np.uint64(min(max(1.0, np.ceil(low * offset)), 2.0 * MOST_COUNTED + 1.0))
+    numbers = np.uint64(counts.shape[1])
+    flat, four = counts.ravel(), packed.ravel()
     is_low = np.empty(_WORD, np.uint8)
+    eight = is_low.view(np.uint64)
     for band in range(len(coming_first) - 1):
         gone = leaving[leaving_first[band] : leaving_first[band + 1]]
         came = coming[coming_first[band] : coming_first[band + 1]]
         start = band << BAND_SHIFT
-        touched = _subtract(gone, start, flag, counts) | _add(came, start, flag, counts)
+        touched = _subtract(gone, start, flag, flat, numbers) | _add(came, start, flag, flat, numbers)
         while touched:
-            word = (start >> WORD_SHIFT) + lowest_bit(touched)
+            word = np.uint64(start >> WORD_SHIFT) + np.uint64(lowest_bit(touched))
             touched &= touched - np.uint64(1)
-            low_bits[word] = _find_low(counts, packed, word << WORD_SHIFT, fewest, low, offset, is_low)
+            found = np.uint64(0)
+            if _has_candidate(four, numbers, word, fewest):
+                _find_low(flat, numbers, word, low, offset, is_low)
+                for k in range(8):
+                    found |= ((eight[k] * _GATHER) >> np.uint64(56)) << np.uint64(8 * k)
+            low_bits[word] = found
 
 
 @njit(cache=True, nogil=True)
@@ -204,7 +212,7 @@ def lowest_bit(bits):  # type: ignore[no-untyped-def]
 def _place(code, start, numbers):  # type: ignore[no-untyped-def]
     """Return where an event of the band that begins at pixel ``start`` is counted, in all the counts on end."""
     # Unsigned, so that no place is taken to count from the end.
-    return np.uint64(code & ON) * np.uint64(numbers) + np.uint64(start) + np.uint64(code >> CODE_BITS)
+    return np.uint64(code & ON) * numbers + np.uint64(start) + np.uint64(code >> CODE_BITS)
 
 
 @njit(cache=True, nogil=True)
@@ -214,52 +222,52 @@ def _word_of(code):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _subtract(code, start, flag, counts):  # type: ignore[no-untyped-def]
+def _subtract(code, start, flag, counts, numbers):  # type: ignore[no-untyped-def]
     """Take events off the counts of the band that begins at pixel ``start``; return the words they are in."""
-    numbers, flat = counts.shape[1], counts.ravel()
     touched = np.uint64(0)
     for i in range(len(code)):
         if not code[i] & flag:
-            flat[_place(code[i], start, numbers)] -= np.uint16(1)
+            counts[_place(code[i], start, numbers)] -= np.uint16(1)
             touched |= _word_of(code[i])
     return touched
 
 
 @njit(cache=True, nogil=True)
-def _add(code, start, flag, counts):  # type: ignore[no-untyped-def]
+def _add(code, start, flag, counts, numbers):  # type: ignore[no-untyped-def]
     """Count events of the band that begins at pixel ``start``; flag those that a full count does not hold."""
-    numbers, flat = counts.shape[1], counts.ravel()
     touched = np.uint64(0)
     for i in range(len(code)):
         place = _place(code[i], start, numbers)
         touched |= _word_of(code[i])
-        if flat[place] < MOST_COUNTED:
-            flat[place] += np.uint16(1)
+        if counts[place] < MOST_COUNTED:
+            counts[place] += np.uint16(1)
         else:
             code[i] |= np.uint16(flag)
     return touched
 
 
 @njit(cache=True, nogil=True)
-def _find_low(counts, packed, pixel, fewest, low, offset, is_low):  # type: ignore[no-untyped-def]
-    """Return the bits of the low pixels of the word that begins at ``pixel``; ``is_low`` is room for 64.
+def _has_candidate(four, numbers, word, fewest):  # type: ignore[no-untyped-def]
+    """Return whether any pixel of a word has the fewest events that a low pixel can have.
 
-    A word of which no pixel has the fewest events is passed over at once.  Four pixels are looked at in one 64-bit
-    number: their n is below 2¹⁵, and adding 2¹⁵ - fewest sets the upper bit of those with enough.
+    Four pixels are looked at in one 64-bit number: their n is below 2¹⁵, and adding 2¹⁵ - fewest sets the upper bit
+    of those with enough.
     """
     enough = (np.uint64(1 << 15) - fewest) * _EACH
-    four = slice(pixel >> 2, (pixel + _WORD) >> 2)
-    packed_off, packed_on = packed[0, four], packed[1, four]
+    off = word << np.uint64(WORD_SHIFT - 2)
+    on = off + (numbers >> np.uint64(2))
     some = np.uint64(0)
     for k in range(_WORD >> 2):
-        some |= packed_off[k] + packed_on[k] + enough
-    found = np.uint64(0)
-    if some & _UPPER:
-        off, on = counts[0, pixel : pixel + _WORD], counts[1, pixel : pixel + _WORD]
-        for k in range(_WORD):
-            n, difference = np.int32(off[k]) + np.int32(on[k]), abs(np.int32(on[k]) - np.int32(off[k]))
-            is_low[k] = (n > 0) & (n >= low * (offset + difference))
-        eight = is_low.view(np.uint64)
-        for k in range(8):
-            found |= ((eight[k] * _GATHER) >> np.uint64(56)) << np.uint64(8 * k)
-    return found
+        some |= four[off + np.uint64(k)] + four[on + np.uint64(k)] + enough
+    return some & _UPPER != np.uint64(0)
+
+
+@njit(cache=True, nogil=True)
+def _find_low(counts, numbers, word, low, offset, is_low):  # type: ignore[no-untyped-def]
+    """Tell of each of a word's 64 pixels whether it is above the lower threshold."""
+    at_off = word << np.uint64(WORD_SHIFT)
+    at_on = at_off + numbers
+    for k in range(_WORD):
+        off, on = np.int32(counts[at_off + np.uint64(k)]), np.int32(counts[at_on + np.uint64(k)])
+        n, difference = off + on, abs(on - off)
+        is_low[k] = (n > 0) & (n >= low * (offset + difference))

@@ -77,7 +77,7 @@ class Router:
         self._t_hop_ns = t_hop_ns
         now, then = positions_at(tracks, t_hop_ns), positions_at(tracks, t_hop_ns + self._hop_ns)
         radius = np.array([track.extent_px for track in tracks]) * self._factor + self._margin
-        circle = np.column_stack((now, (then - now) / self._hop_ns, radius))
+        circle = np.column_stack((now, (then - now) / self._hop_ns, radius**2))
         low, high = np.minimum(now, then) - radius[:, None], np.maximum(now, then) + radius[:, None]
         box = np.column_stack((low[:, 0], high[:, 0], low[:, 1], high[:, 1]))
         self._circle = circle
@@ -173,39 +173,42 @@ def _count_bands(word, in_band):  # type: ignore[no-untyped-def]
 def _find_owners(  # type: ignore[no-untyped-def]
     x, y, t_ns, t_hop_ns, circle, first, member, cells_across, index, owner, word, count
 ):
-    """List the events that are of a track, with their tracks, and count them by track; return how many."""
-    near = np.uint64(0)
+    """List the events that are of a track, with their tracks, and count them by track; return how many.
+
+    First those that lie in a cell with a circle, then of these the nearest circle that holds each; the first of equals.
+    """
+    near = np.uint64(0)  # unsigned, so that no place is taken to count from the end
     for i in range(len(x)):
-        cell = np.uint64(y[i] >> CELL_SHIFT) * np.uint64(cells_across) + np.uint64(x[i] >> CELL_SHIFT)
+        cell = _cell(x[i], y[i], cells_across)
         index[near] = i
         near += np.uint64(first[cell] != first[cell + np.uint64(1)])
-    routed = 0
+    routed = np.uint64(0)
     for j in range(near):
-        i = index[j]
-        cell = np.int64(y[i] >> CELL_SHIFT) * cells_across + np.int64(x[i] >> CELL_SHIFT)
-        k = _nearest(x[i], y[i], t_ns[i] - t_hop_ns, circle, member[first[cell] : first[cell + 1]])
-        if k >= 0:
+        i = np.uint64(index[j])
+        cell = _cell(x[i], y[i], cells_across)
+        ex, ey, dt_ns = np.int64(x[i]), np.int64(y[i]), t_ns[i] - t_hop_ns
+        nearest2 = np.inf
+        best = -1
+        for at in range(np.uint64(first[cell]), np.uint64(first[cell + np.uint64(1)])):
+            k = np.uint64(member[at])
+            dx = ex - (circle[k, 0] + circle[k, 2] * dt_ns)
+            dy = ey - (circle[k, 1] + circle[k, 3] * dt_ns)
+            d2 = dx * dx + dy * dy
+            if d2 <= circle[k, 4] and d2 < nearest2:
+                nearest2 = d2
+                best = np.int64(k)
+        if best >= 0:
             word[i] |= np.uint32(ROUTED)
             index[routed] = i
-            owner[routed] = k
-            count[k] += 1
-            routed += 1
-    return routed
+            owner[routed] = best
+            count[best] += 1
+            routed += np.uint64(1)
+    return np.int64(routed)
 
 
 @njit(cache=True, nogil=True)
-def _nearest(x, y, dt_ns, circle, among):  # type: ignore[no-untyped-def]
-    """Return the nearest of the circles that hold an event, -1 if none does; the first one of equals."""
-    nearest2 = np.inf
-    best = -1
-    for k in among:
-        dx = x - (circle[k, 0] + circle[k, 2] * dt_ns)
-        dy = y - (circle[k, 1] + circle[k, 3] * dt_ns)
-        d2 = dx * dx + dy * dy
-        if d2 <= circle[k, 4] ** 2 and d2 < nearest2:
-            nearest2 = d2
-            best = k
-    return best
+def _cell(x, y, cells_across):  # type: ignore[no-untyped-def]
+    return np.uint64(y >> CELL_SHIFT) * np.uint64(cells_across) + np.uint64(x >> CELL_SHIFT)
 
 
 @njit(cache=True, nogil=True)
