@@ -14,12 +14,13 @@ from beacon_comm.core.events import NS_PER_S, EventBatch
 from beacon_comm.core.framing import CharacterFrame, transitions
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.receiver import Receiver, SignalReceiver
-from beacon_comm.wire.cdr import build_event_packet
+from beacon_comm.wire.cdr import build_event_array, build_event_packet
 from beacon_comm.wire.evt3_encoder import Evt3Encoder
 from beacon_comm.wire.stream import PACKET_TYPES, EventStream
 
 SIZE = 16
 PACKETS = 8
+ARRAY_TYPE = 'dvs_msgs/msg/EventArray'
 ENCODINGS = ('libcaer_cmp', 'libcaer', 'mono')
 
 
@@ -66,6 +67,8 @@ def warm_up(parameters: Parameters, pixels: bool = True) -> None:
     receiver.beacons()
     for encoding in ENCODINGS:
         EventStream(PACKET_TYPES[0]).push(_packet(encoding, bytes(64), 0))
+    few = (column[:3] for column in (events.x, events.y, events.polarity, events.t_ns))
+    EventStream(ARRAY_TYPE).push(build_event_array(NS_PER_S, 'warm_up', SIZE, SIZE, *few))
 
 
 def _packet(encoding: str, payload: bytes, sequence: int) -> bytes:
