@@ -1,4 +1,4 @@
-# make setup | demo | test | lint | clean.  All of it happens in .venv; nothing else is installed.
+# make setup | demo | test | bench | lint | clean.  All of it happens in .venv; nothing else is installed.
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -23,13 +23,14 @@ BUILD_FILES := CMakeLists.txt setup.py setup.cfg pyproject.toml package.xml $(wi
 INTERFACE := interfaces/event_camera_msgs
 INTERFACE_FILES := $(INTERFACE)/package.xml $(INTERFACE)/CMakeLists.txt $(wildcard $(INTERFACE)/msg/*.msg)
 
-.PHONY: help setup demo test lint clean
+.PHONY: help setup demo test bench lint clean
 .DELETE_ON_ERROR:
 
 help:
 	@echo 'make setup   make .venv: Python, ROS 2 from PyPI, this package with its messages, test tools'
 	@echo 'make demo    setup, then replay a short recording into the live node and print what it reads'
 	@echo 'make test    setup, then lint and all tests'
+	@echo 'make bench   setup, then measure the speed on one core: a table, and bench.json'
 	@echo 'make lint    setup, then ruff and mypy'
 	@echo 'make clean   remove .venv and everything built'
 
@@ -45,6 +46,11 @@ lint: setup
 
 test: lint
 	@$(BIN)/pytest test
+
+# PyPI's evt3 is only compared with; the bench says so where it is missing.
+bench: setup
+	@$(BIN)/python -c 'import evt3' 2>/dev/null || $(BIN)/python -m pip install --quiet evt3 || true
+	@$(BIN)/python bench/bench.py
 
 clean:
 	rm -rf $(VENV) build install log *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -1,0 +1,323 @@
+#!/usr/bin/env python3
+"""Measure the speed of the chain, stage by stage and as a whole; print tables, write ``bench.json`` and a figure.
+
+    make bench                                                  # under ten minutes
+    python bench/bench.py [--only decoding chain …] [--json bench.json] [--figure docs/figures/speed.png]
+
+One core; all times are processor time of this process, the best of several runs.  ``bench.json`` is one flat object:
+each key ends with its unit.  What is measured live, through DDS, is a section of its own: add it to ``SECTIONS``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numba
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))  # PYTHONSAFEPATH leaves it out
+
+from measuring import ChainRun, MetricTable, best_s, mev_per_s, module_ns, run_chain  # noqa: E402
+from streams import Stream, make_stream, messages, real_words  # noqa: E402
+
+from beacon_comm.compiling.warm_up import warm_up  # noqa: E402
+from beacon_comm.core.detection import Detector  # noqa: E402
+from beacon_comm.core.parameters import Parameters  # noqa: E402
+from beacon_comm.reference.detection import ReferenceDetector  # noqa: E402
+from beacon_comm.reference.evt3 import ReferenceEvt3Decoder  # noqa: E402
+from beacon_comm.wire.cdr import build_event_packet, parse_event_packet  # noqa: E402
+from beacon_comm.wire.stream import EventStream  # noqa: E402
+
+PROJECT = Path(__file__).resolve().parents[1]
+PACKET_TYPE, ARRAY_TYPE = 'event_camera_msgs/msg/EventPacket', 'dvs_msgs/msg/EventArray'
+HD, VGA = (1280, 720), (640, 480)
+MEGABYTE = 1_000_000
+DENSE = 2.0
+"""index_threshold in a scene of so many events: every pixel has some of both polarities in the long window."""
+
+
+def row(*cells: object) -> None:
+    """Print a table's line."""
+    shown = (f'{cell:.4g}' if isinstance(cell, float) else str(cell) for cell in cells)
+    print('| ' + ' | '.join(shown) + ' |', flush=True)
+
+
+def head(title: str, *columns: str) -> None:
+    """Print a section's title and the head of its table."""
+    print(f'\n## {title}\n')
+    row(*columns)
+    row(*['---'] * len(columns))
+
+
+def push_all(message_type: str, cdrs: Sequence[bytes]) -> int:
+    """Decode messages; return their events."""
+    stream = EventStream(message_type)
+    for cdr in cdrs:
+        stream.push(cdr)
+    return stream.counts['events']
+
+
+def decoding(folder: Path) -> MetricTable:
+    """Measure the decoders alone: the real evt3 words against numpy and PyPI's evt3, and every encoding."""
+    metrics: MetricTable = {}
+    head('Decoding', 'what', 'Mev/s', 'MB/s', 'times numpy', 'times evt3 (PyPI)')
+    payloads, size = real_words(folder, 100 * MEGABYTE, 256_000)
+    cdrs = [build_event_packet(k, 'camera', *size, k, 0, 'evt3', payload) for k, payload in enumerate(payloads)]
+    few = payloads[:20]
+    events = push_all(PACKET_TYPE, cdrs)
+
+    def decode_by_numpy() -> int:
+        decoder = ReferenceEvt3Decoder(*size)
+        batches = [decoder.decode(np.frombuffer(payload, np.uint8)) for payload in few]
+        return sum(len(batch) for batch in batches if batch is not None)
+
+    ours = metrics['evt3_decode_mev_per_s'] = mev_per_s(events, best_s(lambda: push_all(PACKET_TYPE, cdrs)))
+    by_numpy = mev_per_s(decode_by_numpy(), best_s(decode_by_numpy))
+    metrics['evt3_numpy_decode_mev_per_s'] = by_numpy
+    metrics['evt3_decode_over_numpy_ratio'] = ours / by_numpy
+    theirs = decode_by_pypi(payloads)
+    if theirs is not None:
+        metrics['evt3_pypi_decode_mev_per_s'] = theirs
+        metrics['evt3_decode_over_pypi_ratio'] = ours / theirs
+    size_mb = sum(map(len, payloads)) / MEGABYTE
+    times_theirs = ours / theirs if theirs else '–'
+    row('real evt3 words, 256 kB a packet', ours, ours * size_mb / events * 1e6, ours / by_numpy, times_theirs)
+    payloads, size = real_words(folder, 20 * MEGABYTE)
+    cdrs = [build_event_packet(k, 'camera', *size, k, 0, 'evt3', payload) for k, payload in enumerate(payloads)]
+    count = push_all(PACKET_TYPE, cdrs)
+    speed = mev_per_s(count, best_s(lambda: push_all(PACKET_TYPE, cdrs)))
+    metrics['evt3_driver_packets_decode_mev_per_s'] = speed
+    row('the same, packets of 4 ms and 664 events', speed, speed * sum(map(len, payloads)) / count, '–', '–')
+    stream = make_stream(folder, HD, 40e6, 0.2)
+    for encoding in ('evt3', 'libcaer_cmp', 'libcaer', 'mono', 'event_array'):
+        message_type = ARRAY_TYPE if encoding == 'event_array' else PACKET_TYPE
+        cdrs = list(messages(stream, encoding))
+        events = push_all(message_type, cdrs)
+        if events != stream.events:
+            raise SystemExit(f'{encoding}: {events} of {stream.events} events came back')
+        speed = mev_per_s(events, best_s(lambda t=message_type, c=cdrs: push_all(t, c)))  # type: ignore[misc]
+        metrics[f'{encoding}_dense_decode_mev_per_s'] = speed
+        row(f'{encoding}, 40,000 events a packet', speed, speed * sum(map(len, cdrs)) / events, '–', '–')
+    return metrics
+
+
+def decode_by_pypi(payloads: Sequence[bytes]) -> float | None:
+    """Return what PyPI's evt3 makes of the same words (Mev/s), None if it is not installed."""
+    try:
+        import evt3
+    except ImportError:
+        print('evt3 is not installed (pip install evt3): not compared with', file=sys.stderr)
+        return None
+
+    def decode() -> int:
+        decoder = evt3.Decoder()
+        return sum(len(decoder.feed(payload)) for payload in payloads)
+
+    return mev_per_s(decode(), best_s(decode))
+
+
+CHAIN = (
+    # key, sensor, background (events/s), index_threshold
+    ('', HD, 20e6, DENSE),
+    ('vga_', VGA, 8e6, DENSE),
+    ('40mev_', HD, 40e6, DENSE),
+    ('default_threshold_', HD, 7e6, 0.6),
+    ('sparse_vga_', VGA, 1e6, 0.6),
+)
+
+
+def chain(folder: Path) -> MetricTable:
+    """Measure bytes to characters, window and morphology included, and the share of each part."""
+    metrics: MetricTable = {}
+    head(
+        'From evt3 bytes to characters, two beacons', 'sensor', 'background Mev/s', 'index_threshold', 'receiver', 'Mev/s',
+        'of real time', 'decoding ns', 'detection ns', 'demodulation ns an event', 'tracks', 'confirmed', 'characters',
+    )  # fmt: skip
+    for key, size, rate, threshold in CHAIN:
+        stream = make_stream(folder, size, rate, 25e6 / max(rate, 10e6))
+        cdrs = list(messages(stream, 'evt3'))
+        for receiver in ('threshold', 'sequence'):
+            parameters = Parameters(receiver=receiver, index_threshold=threshold)
+            run = best_chain(cdrs, size, parameters)
+            name = f'{key}evt3_to_characters' + ('' if receiver == 'threshold' else '_sequence')
+            metrics[f'{name}_mev_per_s'] = mev_per_s(run.events, run.total_s)
+            print_chain(stream, rate, threshold, receiver, run)
+        if not key:
+            part = cdrs[:60]
+            run = run_chain(part, size, replace(parameters, receiver='threshold'), ReferenceDetector)
+            by_numpy = mev_per_s(run.events, run.total_s - run.decode_s + numpy_decode_s(part, size))
+            metrics['numpy_reference_mev_per_s'] = by_numpy
+            metrics['evt3_to_characters_over_numpy_ratio'] = metrics['evt3_to_characters_mev_per_s'] / by_numpy
+            row('all in plain numpy', '', '', 'threshold', by_numpy, *[''] * 7)
+    return metrics
+
+
+def numpy_decode_s(cdrs: Sequence[bytes], size: tuple[int, int]) -> float:
+    """Return how long plain numpy takes to decode (s)."""
+    payloads = [parse_event_packet(cdr).payload for cdr in cdrs]
+
+    def decode() -> None:
+        decoder = ReferenceEvt3Decoder(*size)
+        for payload in payloads:
+            decoder.decode(payload)
+
+    return best_s(decode, 1)
+
+
+def best_chain(cdrs: Sequence[bytes], size: tuple[int, int], parameters: Parameters, repeats: int = 2) -> ChainRun:
+    """Return the quickest of several runs."""
+    return min((run_chain(cdrs, size, parameters, Detector) for _ in range(repeats)), key=lambda run: run.total_s)
+
+
+def print_chain(stream: Stream, rate: float, threshold: float, receiver: str, run: ChainRun) -> None:
+    """Print a run's line."""
+    ns = [seconds / run.events * 1e9 for seconds in (run.decode_s, run.detect_s, run.demodulate_s)]
+    row(
+        f'{stream.width} x {stream.height}', rate / 1e6, threshold, receiver, mev_per_s(run.events, run.total_s),
+        f'{stream.seconds / run.total_s:.2f} x', *ns, run.tracks, run.confirmed, run.characters,
+    )  # fmt: skip
+
+
+def stages(folder: Path) -> MetricTable:
+    """Print in which modules the time goes, by the profiler, whose own cost is in the calls."""
+    for size, rate, threshold in ((HD, 20e6, DENSE), (VGA, 1e6, 0.6)):
+        cdrs = list(messages(make_stream(folder, size, rate, 0.5), 'evt3'))
+        parameters = Parameters(receiver='threshold', index_threshold=threshold)
+        table = module_ns(lambda c=cdrs, s=size, p=parameters: run_chain(c, s, p, Detector))  # type: ignore[misc]
+        total = sum(table.values())
+        head(f'Where the time goes: {size[0]} x {size[1]}, {rate / 1e6:g} Mev/s', 'module', 'ns an event', 'share')
+        for module, ns in list(table.items())[:12]:
+            row(module, ns, f'{ns / total:.0%}')
+    return {}
+
+
+HOPS = ((0.0, 0.6, 'two_beacons'), (1e6, 0.6, '1mev'), (10e6, DENSE, '10mev'), (40e6, DENSE, '40mev'))
+
+
+def hops(folder: Path) -> MetricTable:
+    """Measure what a hop costs beside its events' decoding and routing: windows, threshold, morphology, components."""
+    metrics: MetricTable = {}
+    head('A hop: windows, threshold, morphology, components, tracks', 'sensor', 'background Mev/s', 'index_threshold', 'ms a hop')
+    for size, name in ((HD, 'hd'), (VGA, 'vga')):
+        for rate, threshold, label in HOPS:
+            stream = make_stream(folder, size, rate, 0.2, packet_ns=10_000_000)
+            parameters = Parameters(index_threshold=threshold)
+            times = []
+            for _ in range(2):
+                detector = Detector(parameters, size)
+                for batch in stream.batches:
+                    detector.route(batch.slice(0, int(np.searchsorted(batch.t_ns, batch.t_end_ns)), batch.t_end_ns))
+                    begun = time.process_time()
+                    detector.hop(batch.t_end_ns)
+                    times.append(time.process_time() - begun)
+            metrics[f'hop_{name}_{label}_ms'] = float(np.median(times) * 1e3)
+            row(f'{size[0]} x {size[1]}', rate / 1e6, threshold, metrics[f'hop_{name}_{label}_ms'])
+    return metrics
+
+
+SCALING_BEACONS, SCALING_RATES = (2, 16, 64), (1e6, 5e6, 20e6)
+
+
+def scaling(folder: Path) -> MetricTable:
+    """Measure the cost of an event by beacons, rate and sensor; and of the beacons themselves."""
+    metrics: MetricTable = {}
+    head(
+        'How the cost grows (receiver: threshold)', 'sensor', 'background Mev/s', 'beacons', 'Mev/s in all',
+        'decoding and detection ns an event', 'all, ms a hop', 'demodulation ms a hop and beacon', 'confirmed',
+    )  # fmt: skip
+    for size, name in ((VGA, 'vga'), (HD, 'hd')):
+        for rate in SCALING_RATES:
+            for count in SCALING_BEACONS:
+                stream = make_stream(folder, size, rate, 0.4, count, packet_ns=5_000_000)
+                cdrs = list(messages(stream, 'evt3'))
+                parameters = Parameters(receiver='threshold', index_threshold=DENSE, candidate_slots=80)
+                run = best_chain(cdrs, size, parameters)
+                hop_count = stream.seconds * 100
+                key = f'scaling_{name}_{rate / 1e6:g}mev_{count}_beacons'
+                metrics[f'{key}_ns_per_event'] = (run.decode_s + run.detect_s) / run.events * 1e9
+                metrics[f'{key}_ms_per_hop'] = run.total_s / hop_count * 1e3
+                metrics[f'{key}_demodulation_ms_per_hop_and_beacon'] = run.demodulate_s / hop_count / count * 1e3
+                row(
+                    f'{size[0]} x {size[1]}', rate / 1e6, count, stream.events / stream.seconds / 1e6,
+                    metrics[f'{key}_ns_per_event'], metrics[f'{key}_ms_per_hop'],
+                    metrics[f'{key}_demodulation_ms_per_hop_and_beacon'], run.confirmed,
+                )  # fmt: skip
+    return metrics
+
+
+def draw(metrics: MetricTable, path: Path) -> None:
+    """Draw the cost of a hop by rate, and of a beacon by beacons."""
+    import matplotlib
+
+    matplotlib.use('Agg')
+    from matplotlib import pyplot as plt
+
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2), layout='constrained')
+    rates = [rate / 1e6 for rate in SCALING_RATES]
+    for name, label, style in (('vga', '640 x 480', '--'), ('hd', '1280 x 720', '-')):
+        for count, colour in zip(SCALING_BEACONS, ('tab:blue', 'tab:orange', 'tab:green'), strict=True):
+            keys = [f'scaling_{name}_{rate:g}mev_{count}_beacons' for rate in rates]
+            values = [metrics[f'{key}_ms_per_hop'] for key in keys]
+            left.plot(rates, values, style, color=colour, marker='o', label=f'{count} beacons, {label}')
+        for rate, colour in zip(rates, ('tab:red', 'tab:purple', 'tab:brown'), strict=True):
+            keys = [f'scaling_{name}_{rate:g}mev_{count}_beacons' for count in SCALING_BEACONS]
+            values = [metrics[f'{key}_demodulation_ms_per_hop_and_beacon'] for key in keys]
+            right.plot(SCALING_BEACONS, values, style, color=colour, marker='o', label=f'{rate:g} Mev/s, {label}')
+    left.axhline(10, color='0.6', linewidth=1)
+    left.text(rates[0], 10.3, 'real time: a hop is 10 ms', color='0.4', fontsize=8)
+    left.set(xlabel='background (million events a second)', ylabel='processor time a hop (ms)', title='Bytes to characters')
+    right.set(xlabel='beacons', ylabel='demodulation, ms a hop and beacon', title='What one more beacon costs', xscale='log')
+    right.set_xticks(SCALING_BEACONS, [str(count) for count in SCALING_BEACONS])
+    right.minorticks_off()
+    for axes in (left, right):
+        axes.set_ylim(0, None)
+        axes.legend(fontsize=7)
+        axes.grid(alpha=0.3)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+SECTIONS: dict[str, Callable[[Path], MetricTable]] = {
+    'decoding': decoding,
+    'chain': chain,
+    'stages': stages,
+    'hops': hops,
+    'scaling': scaling,
+}
+
+
+def main() -> None:
+    """Run the sections asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    usual = os.environ.get('BEACON_COMM_DATA', PROJECT.parent / 'shared' / 'data')
+    parser.add_argument('--folder', type=Path, default=usual, help='folder of the recordings')
+    parser.add_argument('--only', nargs='+', choices=SECTIONS, default=list(SECTIONS), help='sections to run')
+    parser.add_argument('--json', type=Path, default=PROJECT / 'bench.json', help='where the metrics go')
+    parser.add_argument('--figure', type=Path, help='where the plot of the scaling goes')
+    arguments = parser.parse_args()
+    if not Path(arguments.folder).is_dir():
+        raise SystemExit(f'{arguments.folder}: no such folder; the bench needs the recordings (--folder)')
+    begun = time.perf_counter()
+    for receiver in ('threshold', 'sequence'):
+        warm_up(Parameters(receiver=receiver))
+    print(f'# Speed on one core\n\n{platform.machine()}, Python {platform.python_version()}, numba {numba.__version__}')
+    metrics: MetricTable = {}
+    for name in arguments.only:
+        metrics |= SECTIONS[name](Path(arguments.folder))
+    if arguments.figure is not None and 'scaling' in arguments.only:
+        draw(metrics, arguments.figure)
+    metrics['bench_wall_s'] = time.perf_counter() - begun
+    arguments.json.write_text(json.dumps({key: round(value, 4) for key, value in metrics.items()}, indent=1) + '\n')
+    print(f'\n{arguments.json}: {len(metrics)} metrics, {metrics["bench_wall_s"]:.0f} s')
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,235 @@
+"""Streams to measure with: a real background as dense as wanted, with the real beacons in it.
+
+    bag              |grid moving over 346 x 260 px|            571,000 events a second
+    side by side     |bag|bag|bag|bag|                          until the sensor is full, each begun elsewhere in the bag
+                     |bag|bag|bag|bag|
+    faster           the bag's clock runs as fast as the wanted rate needs: a grid that moves faster
+    over and over    |bag, bag, …|bag, bag, …|                  for as long as wanted
+    beacons          · ·· ··· · ·· ·· · ··· ·                   the recordings at 30 m, in their own time
+    packets          |  1 ms |  1 ms |  1 ms |…                 in any of the encodings
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beacon_comm.core.events import NS_PER_S, EventBatch
+from beacon_comm.recordings.bags import open_recording
+from beacon_comm.recordings.disc import Disc
+from beacon_comm.recordings.mat import read_mat
+from beacon_comm.wire.cdr import build_event_array, build_event_packet, parse_event_packet
+from beacon_comm.wire.evt3 import TIME_HIGH
+from beacon_comm.wire.evt3_encoder import Evt3Encoder
+from beacon_comm.wire.stream import EventStream
+
+BAG, BAG_SIZE = 'libcaer_grid', (346, 260)
+WORDS_BAG = 'evt3_static'
+RECORDINGS = (('3125hz_30m.mat', 1.0), ('504hz_30m.mat', 12.2))  # and where their text is under way (s)
+START_NS = NS_PER_S
+RADIUS_PX = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """What a camera sent.
+
+    Attributes:
+        width, height: the sensor's size (px).
+        batches: its events, one batch a packet.
+    """
+
+    width: int
+    height: int
+    batches: list[EventBatch]
+
+    @property
+    def events(self) -> int:
+        """Return how many events it has."""
+        return sum(map(len, self.batches))
+
+    @property
+    def seconds(self) -> float:
+        """Return its length (s)."""
+        return (self.batches[-1].t_end_ns - START_NS) / NS_PER_S
+
+
+def bag_events(path: Path) -> EventBatch:
+    """Return all events of a bag in one batch."""
+    with open_recording(path) as bag:
+        topic = bag.event_topic()
+        stream = EventStream(topic.type)
+        decoded = [stream.push(cdr).batch for _, cdr in bag.messages(topic)]
+    batches = [batch for batch in decoded if batch is not None]
+    x, y, polarity, t_ns = (
+        np.concatenate([getattr(batch, name) for batch in batches]) for name in ('x', 'y', 'polarity', 't_ns')
+    )
+    return EventBatch(x, y, polarity, t_ns, batches[-1].t_end_ns)
+
+
+def tiled(once: EventBatch, size: tuple[int, int], events_per_s: float, duration_ns: int) -> EventBatch:
+    """Return the bag's events side by side all over the sensor and over and over, from time 0 on.
+
+    Args:
+        once: the bag's events.
+        size: width and height of the sensor to fill (px).
+        events_per_s: how many there are to be.
+        duration_ns: until when (ns).
+    """
+    width, height = size
+    corners = [(left, top) for left in range(0, width, BAG_SIZE[0]) for top in range(0, height, BAG_SIZE[1])]
+    inside = [(once.x + left < width) & (once.y + top < height) for left, top in corners]
+    period_ns = round(sum(int(which.sum()) for which in inside) / events_per_s * NS_PER_S)
+    faster = period_ns / (int(once.t_ns[-1] - once.t_ns[0]) + 1000)
+    parts = []
+    for k, ((left, top), which) in enumerate(zip(corners, inside, strict=True)):
+        t_ns = ((once.t_ns - once.t_ns[0])[which] * faster).astype(np.int64) + k * period_ns // len(corners)
+        parts.append((once.x[which] + left, once.y[which] + top, once.polarity[which], t_ns % period_ns))
+    x, y, polarity, t_ns = (np.concatenate(column) for column in zip(*parts, strict=True))
+    order = np.argsort(t_ns, kind='stable')
+    count = -(-duration_ns // period_ns)
+    t_all = (t_ns[order] + period_ns * np.arange(count)[:, None]).ravel()
+    n = int(np.searchsorted(t_all, duration_ns))
+    x, y, polarity = (np.tile(column[order], count)[:n] for column in (x, y, polarity))
+    return EventBatch(x.astype(np.uint16), y.astype(np.uint16), polarity, t_all[:n], duration_ns)
+
+
+def looped(t_ns: NDArray[np.int64], polarity: NDArray[np.int8], start_s: float, duration_ns: int) -> EventBatch:
+    """Return a recording's beacon from ``start_s`` on, over and over if it is too short; pixels are all 0."""
+    t_ns = t_ns - t_ns[0] - round(start_s * NS_PER_S)
+    first = int(np.searchsorted(t_ns, 0))
+    t_ns, polarity = t_ns[first:], polarity[first:]
+    period_ns = int(t_ns[-1]) + 1000
+    count = -(-duration_ns // period_ns)
+    t_all = (t_ns + period_ns * np.arange(count)[:, None]).ravel()
+    n = int(np.searchsorted(t_all, duration_ns))
+    pixel = np.zeros(n, np.uint16)
+    return EventBatch(pixel, pixel, np.tile(polarity, count)[:n], t_all[:n], duration_ns)
+
+
+def beacons(folder: Path, size: tuple[int, int], count: int, duration_ns: int) -> list[EventBatch]:
+    """Return ``count`` beacons on a grid, the two recordings by turns, each begun elsewhere in its text."""
+    across = int(np.ceil(np.sqrt(count * size[0] / size[1])))
+    down = -(-count // across)
+    recordings = [(*read_mat(folder / name), start_s) for name, start_s in RECORDINGS]
+    placed = []
+    for k in range(count):
+        t_ns, polarity, start_s = recordings[k % len(recordings)]
+        events = looped(t_ns, polarity, start_s + 0.02 * (k // len(recordings)), duration_ns)
+        x = size[0] * (k % across + 0.5) / across
+        y = size[1] * (k // across + 0.5) / down
+        xs, ys = Disc(x, y, RADIUS_PX, 0.0, 0.0, *size).pixels(events.t_ns, [1, k])
+        placed.append(EventBatch(xs, ys, events.polarity, events.t_ns, duration_ns))
+    return placed
+
+
+def make_stream(
+    folder: Path,
+    size: tuple[int, int],
+    events_per_s: float,
+    duration_s: float,
+    beacon_count: int = 2,
+    packet_ns: int = 1_000_000,
+) -> Stream:
+    """Return a background with beacons in it, cut into packets.
+
+    Args:
+        folder: of the recordings.
+        size: width and height (px).
+        events_per_s: of the background.
+        duration_s: length of the stream (s).
+        beacon_count: how many.
+        packet_ns: length of a packet (ns).
+    """
+    duration_ns = round(duration_s * NS_PER_S)
+    parts = beacons(folder, size, beacon_count, duration_ns)
+    if events_per_s:
+        parts.insert(0, tiled(bag_events(folder / BAG), size, events_per_s, duration_ns))
+    t_ns = np.concatenate([part.t_ns for part in parts]) // 1000 * 1000 + START_NS
+    order = np.argsort(t_ns, kind='stable')
+    t_ns = t_ns[order]
+    x, y, polarity = (np.concatenate([getattr(part, name) for part in parts])[order] for name in ('x', 'y', 'polarity'))
+    ends_ns = np.arange(START_NS + packet_ns, START_NS + duration_ns + 1, packet_ns)
+    stops = np.searchsorted(t_ns, ends_ns)
+    starts = [0, *stops[:-1]]
+    batches = [
+        EventBatch(x[a:b], y[a:b], polarity[a:b], t_ns[a:b], int(end_ns))
+        for a, b, end_ns in zip(starts, stops, ends_ns, strict=True)
+    ]
+    return Stream(*size, batches)
+
+
+def messages(stream: Stream, encoding: str) -> Iterator[bytes]:
+    """Yield the stream's messages (CDR bytes): EventPackets of an encoding, or EventArrays for ``event_array``."""
+    encoder = Evt3Encoder(stream.width, stream.height)
+    for seq, batch in enumerate(stream.batches):
+        begin_ns = int(batch.t_ns[0]) if len(batch) else batch.t_end_ns
+        head = (begin_ns, 'camera', stream.width, stream.height)
+        if encoding == 'event_array':
+            yield build_event_array(*head, batch.x, batch.y, batch.polarity, batch.t_ns)
+        elif encoding == 'evt3':
+            yield build_event_packet(*head, seq, 0, encoding, encoder.encode(batch))
+        else:
+            base_ns = begin_ns // 1000 * 1000
+            yield build_event_packet(*head, seq, base_ns, encoding, _PAYLOADS[encoding](batch, batch.t_ns - base_ns))
+
+
+def _mono(batch: EventBatch, dt_ns: NDArray[np.int64]) -> bytes:
+    on = (batch.polarity > 0).astype('<u8') << np.uint64(63)
+    words = on | batch.y.astype('<u8') << np.uint64(48) | batch.x.astype('<u8') << np.uint64(32) | dt_ns.astype('<u8')
+    return words.tobytes()
+
+
+def _libcaer(batch: EventBatch, dt_ns: NDArray[np.int64]) -> bytes:
+    pixel = batch.x.astype('<u4') << 17 | batch.y.astype('<u4') << 2 | (batch.polarity > 0).astype('<u4') << 1 | 1
+    return np.column_stack((pixel, (dt_ns // 1000).astype('<u4'))).tobytes()
+
+
+def _libcaer_cmp(batch: EventBatch, dt_ns: NDArray[np.int64]) -> bytes:
+    """Return ADDR_X, ADDR_Y for each event, behind its time words where the time is a new one."""
+    t_us = dt_ns // 1000
+    new = np.diff(t_us, prepend=-1) > 0
+    high = np.diff(t_us >> 12, prepend=-1) > 0
+    words = np.empty((len(t_us), 4), '<u2')
+    words[:, 0], words[:, 1] = (t_us >> 12) & 0xFFF, 1 << 12 | (t_us & 0xFFF)
+    words[:, 2], words[:, 3] = 2 << 12 | batch.x, 3 << 12 | (batch.polarity > 0).astype(np.uint16) << 11 | batch.y
+    return words[np.column_stack((high, new, new | True, new | True))].tobytes()
+
+
+_PAYLOADS = {'mono': _mono, 'libcaer': _libcaer, 'libcaer_cmp': _libcaer_cmp}
+
+
+def real_words(folder: Path, total_bytes: int, packet_bytes: int | None = None) -> tuple[list[bytes], tuple[int, int]]:
+    """Return the payloads of the real evt3 bag over and over, and its sensor's size (px).
+
+    Nothing but the upper time bits is changed, so that time goes on from one round to the next.
+
+    Args:
+        folder: of the recordings.
+        total_bytes: how much to return (byte).
+        packet_bytes: length of a payload (byte); None: as the driver cut them.
+    """
+    with open_recording(folder / WORDS_BAG) as bag:
+        packets = [parse_event_packet(cdr) for _, cdr in bag.messages(bag.event_topic())]
+    words = np.concatenate([packet.payload.view('<u2') for packet in packets])
+    lengths = [len(packet.payload) // 2 for packet in packets]
+    is_high = words >> 12 == TIME_HIGH
+    highs = words[is_high].astype(np.int64) & 0xFFF
+    unwrapped = highs + 4096 * np.cumsum(np.diff(highs, prepend=highs[0]) < -2048)
+    round_highs = int(unwrapped[-1] - unwrapped[0]) + 1
+    rounds = []
+    for k in range(-(-total_bytes // (2 * len(words)))):
+        shifted = words.copy()
+        shifted[is_high] = TIME_HIGH << 12 | (highs + k * round_highs) & 0xFFF
+        rounds.append(shifted)
+    if packet_bytes is None:
+        cuts = np.cumsum(lengths)[:-1]
+        payloads = [part.tobytes() for one in rounds for part in np.split(one, cuts)]
+    else:
+        every = np.concatenate(rounds).tobytes()
+        payloads = [every[start : start + packet_bytes] for start in range(0, len(every), packet_bytes)]
+    return payloads, (packets[0].width, packets[0].height)
