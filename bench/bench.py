@@ -205,7 +205,8 @@ HOPS = ((0.0, 0.6, 'two_beacons'), (1e6, 0.6, '1mev'), (10e6, DENSE, '10mev'), (
 def hops(folder: Path) -> MetricTable:
     """Measure what a hop costs beside its events' decoding and routing: windows, threshold, morphology, components."""
     metrics: MetricTable = {}
-    head('A hop: windows, threshold, morphology, components, tracks', 'sensor', 'background Mev/s', 'index_threshold', 'ms a hop')
+    title = 'A hop: windows, threshold, morphology, components, tracks'
+    head(title, 'sensor', 'background Mev/s', 'index_threshold', 'ms a hop')
     for size, name in ((HD, 'hd'), (VGA, 'vga')):
         for rate, threshold, label in HOPS:
             stream = make_stream(folder, size, rate, 0.2, packet_ns=10_000_000)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from beacon_comm.core.blobs import BlobFinder
 from beacon_comm.core.components import AREA, BOTTOM, COUNT, LEFT, RIGHT, SEEDS, TOP, ComponentFinder
-from beacon_comm.core.hop_events import CODE_BITS, ON, PixelGrid
+from beacon_comm.core.hop_events import BAND_PIXELS, CODE_BITS, ON, PixelGrid
 from beacon_comm.core.index_image import IndexImages
 from beacon_comm.core.parameters import Parameters
 
@@ -181,11 +181,14 @@ def test_noise_makes_no_blob():
 
 
 def test_the_routers_words_are_the_events_band_by_band():
-    segment = next(iter(hops(noise(*SIZE, 100_000, 0.005))))
-    events, grid = packed(segment), PixelGrid(*SIZE)
-    band = np.repeat(np.arange(grid.bands), np.diff(events.first))
-    y, x = np.divmod(band * 4096 + (events.code >> CODE_BITS), grid.stride)
-    order = np.argsort(segment.y // (4096 // grid.stride), kind='stable')
+    size = (600, 300)
+    segment = next(iter(hops(noise(*size, 1_000_000, 0.005))))
+    events, grid = gathered(segment, size), PixelGrid(*size)
+    assert grid.bands > 3
+    y, x = np.divmod(events.code >> CODE_BITS, grid.stride)
+    band = segment.y // (BAND_PIXELS // grid.stride)
+    order = np.argsort(band, kind='stable')
+    np.testing.assert_array_equal(np.diff(events.first), np.bincount(band, minlength=grid.bands))
     np.testing.assert_array_equal(x, segment.x[order])
     np.testing.assert_array_equal(y, segment.y[order])
     np.testing.assert_array_equal((events.code & ON) > 0, segment.polarity[order] > 0)

@@ -67,8 +67,10 @@ def warm_up(parameters: Parameters, pixels: bool = True) -> None:
     receiver.beacons()
     for encoding in ENCODINGS:
         EventStream(PACKET_TYPES[0]).push(_packet(encoding, bytes(64), 0))
-    few = (column[:3] for column in (events.x, events.y, events.polarity, events.t_ns))
-    EventStream(ARRAY_TYPE).push(build_event_array(NS_PER_S, 'warm_up', SIZE, SIZE, *few))
+    few = events.slice(0, 3, events.t_end_ns)
+    EventStream(ARRAY_TYPE).push(
+        build_event_array(NS_PER_S, 'warm_up', SIZE, SIZE, few.x, few.y, few.polarity, few.t_ns)
+    )
 
 
 def _packet(encoding: str, payload: bytes, sequence: int) -> bytes:

@@ -256,7 +256,7 @@ def _sum_newest(  # type: ignore[no-untyped-def]
         if first[top * cells_across] == first[bottom * cells_across]:
             continue
         for i in range(band_first[band], band_first[band + 1]):
-            p = start + (np.int64(code[i]) >> CODE_BITS)
+            p = np.int64(code[i] >> np.uint32(CODE_BITS))
             y = p >> shift
             x = p - (y << shift)
             cell = np.uint64((y >> CELL_SHIFT) * cells_across + (x >> CELL_SHIFT))

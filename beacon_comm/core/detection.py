@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from beacon_comm.core.blobs import Blob, BlobFinder
 from beacon_comm.core.event_buffer import EventBuffer, buffer_length_ns
 from beacon_comm.core.events import EventBatch
-from beacon_comm.core.hop_events import BAND_SHIFT, CODE_BITS, ON, ROUTED
+from beacon_comm.core.hop_events import CODE_BITS, ON, ROUTED
 from beacon_comm.core.index_image import IndexImages, hop_length_ns
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.routing import Routed, Router
@@ -193,9 +193,7 @@ class Detector:
             if not wanted.any():
                 continue
             parts = [
-                _events_on(
-                    events.code, events.offset_ns, events.first, events.t_start_ns, self._blobs.owner, wanted
-                )
+                _events_on(events.code, events.offset_ns, events.t_start_ns, self._blobs.owner, wanted)
                 for events in self._images.hop_events(window)
                 if len(events)
             ]
@@ -208,20 +206,18 @@ class Detector:
 
 
 @njit(cache=True, nogil=True)
-def _events_on(code, offset_ns, band_first, t_start_ns, owner, wanted):  # type: ignore[no-untyped-def]
+def _events_on(code, offset_ns, t_start_ns, owner, wanted):  # type: ignore[no-untyped-def]
     """Return blob number, time and polarity of the events that no track got and that lie on a wanted blob."""
     number = np.empty(len(code), np.int32)
     t_ns = np.empty(len(code), np.int64)
     polarity = np.empty(len(code), np.int8)
     n = 0
-    for band in range(len(band_first) - 1):
-        start = band << BAND_SHIFT
-        for i in range(band_first[band], band_first[band + 1]):
-            c = np.int64(code[i])
-            b = owner[start + (c >> CODE_BITS)]
-            if b > 0 and wanted[b] and not c & ROUTED:
-                number[n] = b
-                t_ns[n] = t_start_ns + np.int64(offset_ns[i])
-                polarity[n] = 1 if c & ON else -1
-                n += 1
+    for i in range(len(code)):
+        c = np.int64(code[i])
+        b = owner[c >> CODE_BITS]
+        if b > 0 and wanted[b] and not c & ROUTED:
+            number[n] = b
+            t_ns[n] = t_start_ns + np.int64(offset_ns[i])
+            polarity[n] = 1 if c & ON else -1
+            n += 1
     return number[:n], t_ns[:n], polarity[:n]

@@ -1,15 +1,10 @@
 """The events of one hop, sorted into bands of the sensor.
 
 Pixels are numbered row by row with a stride that is a power of two, so that a number is taken apart by shifts, and
-4096 numbers on end are a *band*: whole rows, whose counts fit the processor's innermost cache.
+32,768 numbers on end are a *band*: whole rows, whose counts fit the processor's own cache.
 
-    pixel   p = y stride + x            stride >= width, a power of two      band = p / 4096
-
-A gathered event is one word, its upper half the band and its lower half its place in the band; sorted by band, the
-lower half is all that is kept of it:
-
-    word    uint32  [ band: 16 bits | code ]
-    code    uint16  [ place in band: 12 bits | not counted in the long, short window | routed | on ]
+    pixel   p = y stride + x            stride >= width, a power of two      band = p / 32,768
+    code    uint32  [ p: 28 bits | not counted in the long, short window | routed | on ]
 
 The order within a band is that of arrival.
 """
@@ -24,13 +19,12 @@ from numpy.typing import NDArray
 
 MAX_WIDTH = 1 << 12
 MAX_HEIGHT = 1 << 16
-BAND_SHIFT = 12
+BAND_SHIFT = 15
 BAND_PIXELS = 1 << BAND_SHIFT
 _SHORTEST_STRIDE_SHIFT = 6  # a row of the low pixels' bits is whole words of 64
 
 ON, ROUTED = 1, 2
 CODE_BITS = 4
-CODE_MASK = 0xFFFF
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,13 +72,13 @@ class HopEvents:
     """The events of one hop, band by band.
 
     Attributes:
-        code: place, flags and polarity, ``(n,)`` uint16; see the module's head.
+        code: pixel, flags and polarity, ``(n,)`` uint32; see the module's head.
         offset_ns: time since ``t_start_ns`` (ns), ``(n,)`` uint32.
         first: where each band's events begin, ``(bands + 1,)`` int64.
         t_start_ns: the hop's begin (ns, sensor clock).
     """
 
-    code: NDArray[np.uint16]
+    code: NDArray[np.uint32]
     offset_ns: NDArray[np.uint32]
     first: NDArray[np.int64]
     t_start_ns: int
@@ -99,33 +93,39 @@ class HopEvents:
 
 def no_events(bands: int) -> HopEvents:
     """Return a hop without events."""
-    return HopEvents(np.empty(0, np.uint16), np.empty(0, np.uint32), np.zeros(bands + 1, np.int64), 0)
+    return HopEvents(np.empty(0, np.uint32), np.empty(0, np.uint32), np.zeros(bands + 1, np.int64), 0)
 
 
 def sorted_by_band(
-    word: NDArray[np.uint32], offset_ns: NDArray[np.uint32], in_band: NDArray[np.int64], t_start_ns: int
+    code: NDArray[np.uint32], offset_ns: NDArray[np.uint32], in_band: NDArray[np.int64], t_start_ns: int
 ) -> HopEvents:
     """Sort gathered events.
 
     Args:
-        word: see the module's head, ``(n,)`` uint32.
+        code: see the module's head, ``(n,)`` uint32.
         offset_ns: time since the hop's begin (ns), ``(n,)`` uint32.
-        in_band: how many of the words are of each band, ``(bands,)`` int64.
+        in_band: how many of them are of each band, ``(bands,)`` int64.
         t_start_ns: the hop's begin (ns, sensor clock).
     """
     first = np.zeros(len(in_band) + 1, np.int64)
     np.cumsum(in_band, out=first[1:])
-    code, sorted_ns = np.empty(len(word), np.uint16), np.empty(len(word), np.uint32)
-    _sort(word, offset_ns, first[:-1].copy(), code, sorted_ns)
-    return HopEvents(code, sorted_ns, first, t_start_ns)
+    sorted_code, sorted_ns = np.empty_like(code), np.empty_like(offset_ns)
+    _sort(code, offset_ns, first[:-1].copy(), sorted_code, sorted_ns)
+    return HopEvents(sorted_code, sorted_ns, first, t_start_ns)
 
 
 @njit(cache=True, nogil=True)
-def _sort(word, offset_ns, end, code, sorted_ns):  # type: ignore[no-untyped-def]
+def band_of(code):  # type: ignore[no-untyped-def]
+    """Return the band of an event."""
+    return code >> np.uint32(CODE_BITS + BAND_SHIFT)
+
+
+@njit(cache=True, nogil=True)
+def _sort(code, offset_ns, end, sorted_code, sorted_ns):  # type: ignore[no-untyped-def]
     """Put every event behind those of its band that came before; ``end`` is where each band goes on."""
-    for i in range(len(word)):
-        band = word[i] >> np.uint32(16)
-        at = end[band]
-        end[band] = at + 1
-        code[at] = word[i] & np.uint32(CODE_MASK)
+    for i in range(len(code)):
+        band = band_of(code[i])
+        at = np.uint64(end[band])
+        end[band] = at + np.uint64(1)
+        sorted_code[at] = code[i]
         sorted_ns[at] = offset_ns[i]

@@ -42,9 +42,7 @@ MOST_COUNTED = (1 << 14) - 1
 _NOT_COUNTED = 4  # flag of the short window; the long one's is the next bit
 WORD_SHIFT = 6  # 64 pixels a word of bits
 _WORD = 1 << WORD_SHIFT
-_DE_BRUIJN = np.uint64(0x03F7_9D71_B4CB_0A89)
-_PLACES = np.empty(64, np.int64)
-_PLACES[[(1 << k) * int(_DE_BRUIJN) % (1 << 64) >> 58 for k in range(64)]] = np.arange(64)
+_BAND_WORDS = 1 << (BAND_SHIFT - WORD_SHIFT)
 _EACH = np.uint64(0x0001_0001_0001_0001)
 _UPPER = np.uint64(0x8000_8000_8000_8000)
 _GATHER = np.uint64(0x0102_0408_1020_4080)  # times eight bytes of 0 or 1: the upper byte has them as bits
@@ -179,71 +177,65 @@ def _slide(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Take the leaving events off the counts and add the coming ones, band by band; find the low pixels again.
 
-    A band is 64 words of 64 pixels: which of them had events is one word more.
+    Of a band's words of 64 pixels those are looked at that had events, marked in ``touched``.
     """
     fewest = np.uint64(min(max(1.0, np.ceil(low * offset)), 2.0 * MOST_COUNTED + 1.0))
     numbers = np.uint64(counts.shape[1])
     flat, four = counts.ravel(), packed.ravel()
     is_low = np.empty(_WORD, np.uint8)
     eight = is_low.view(np.uint64)
+    touched = np.zeros(_BAND_WORDS, np.uint8)
     for band in range(len(coming_first) - 1):
         gone = leaving[leaving_first[band] : leaving_first[band + 1]]
         came = coming[coming_first[band] : coming_first[band + 1]]
-        start = band << BAND_SHIFT
-        touched = _subtract(gone, start, flag, flat, numbers) | _add(came, start, flag, flat, numbers)
-        while touched:
-            word = np.uint64(start >> WORD_SHIFT) + np.uint64(lowest_bit(touched))
-            touched &= touched - np.uint64(1)
-            found = np.uint64(0)
-            if _has_candidate(four, numbers, word, fewest):
-                _find_low(flat, numbers, word, low, offset, is_low)
-                for k in range(8):
-                    found |= ((eight[k] * _GATHER) >> np.uint64(56)) << np.uint64(8 * k)
-            low_bits[word] = found
+        if len(gone) == 0 and len(came) == 0:
+            continue
+        _subtract(gone, flag, flat, numbers, touched)
+        _add(came, flag, flat, numbers, touched)
+        for k in range(_BAND_WORDS):
+            if touched[k]:
+                touched[k] = 0
+                word = np.uint64(band * _BAND_WORDS + k)
+                found = np.uint64(0)
+                if _has_candidate(four, numbers, word, fewest):
+                    _find_low(flat, numbers, word, low, offset, is_low)
+                    for byte in range(8):
+                        found |= ((eight[byte] * _GATHER) >> np.uint64(56)) << np.uint64(8 * byte)
+                low_bits[word] = found
 
 
 @njit(cache=True, nogil=True)
-def lowest_bit(bits):  # type: ignore[no-untyped-def]
-    """Return the place of the lowest set bit of a word that has one: 2ᵏ times a de Bruijn number begins with k's 6 bits."""
-    return _PLACES[((bits & (~bits + np.uint64(1))) * _DE_BRUIJN) >> np.uint64(58)]
-
-
-@njit(cache=True, nogil=True)
-def _place(code, start, numbers):  # type: ignore[no-untyped-def]
-    """Return where an event of the band that begins at pixel ``start`` is counted, in all the counts on end."""
+def _place(code, numbers):  # type: ignore[no-untyped-def]
+    """Return where an event is counted, in all the counts on end."""
     # Unsigned, so that no place is taken to count from the end.
-    return np.uint64(code & ON) * numbers + np.uint64(start) + np.uint64(code >> CODE_BITS)
+    return np.uint64(code & ON) * numbers + np.uint64(code >> CODE_BITS)
 
 
 @njit(cache=True, nogil=True)
 def _word_of(code):  # type: ignore[no-untyped-def]
-    """Return the bit of the word of its band that an event is in."""
-    return np.uint64(1) << np.uint64(code >> (CODE_BITS + WORD_SHIFT))
+    """Return which word of its band an event is in."""
+    return np.uint64(code >> (CODE_BITS + WORD_SHIFT)) & np.uint64(_BAND_WORDS - 1)
 
 
 @njit(cache=True, nogil=True)
-def _subtract(code, start, flag, counts, numbers):  # type: ignore[no-untyped-def]
-    """Take events off the counts of the band that begins at pixel ``start``; return the words they are in."""
-    touched = np.uint64(0)
+def _subtract(code, flag, counts, numbers, touched):  # type: ignore[no-untyped-def]
+    """Take a band's events off the counts."""
     for i in range(len(code)):
         if not code[i] & flag:
-            counts[_place(code[i], start, numbers)] -= np.uint16(1)
-            touched |= _word_of(code[i])
-    return touched
+            counts[_place(code[i], numbers)] -= np.uint16(1)
+            touched[_word_of(code[i])] = 1
 
 
 @njit(cache=True, nogil=True)
-def _add(code, start, flag, counts, numbers):  # type: ignore[no-untyped-def]
-    """Count events of the band that begins at pixel ``start``; flag those that a full count does not hold."""
-    touched = np.uint64(0)
+def _add(code, flag, counts, numbers, touched):  # type: ignore[no-untyped-def]
+    """Count a band's events; flag those that a full count does not hold."""
     for i in range(len(code)):
-        place = _place(code[i], start, numbers)
-        touched |= _word_of(code[i])
+        place = _place(code[i], numbers)
+        touched[_word_of(code[i])] = 1
         if counts[place] < MOST_COUNTED:
             counts[place] += np.uint16(1)
         else:
-            code[i] |= np.uint16(flag)
-    return touched
+            code[i] |= np.uint32(flag)
 
 
 @njit(cache=True, nogil=True)

@@ -20,7 +20,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from beacon_comm.core.events import EventBatch
-from beacon_comm.core.hop_events import CODE_BITS, ROUTED, HopEvents, PixelGrid, sorted_by_band
+from beacon_comm.core.hop_events import CODE_BITS, ROUTED, HopEvents, PixelGrid, band_of, sorted_by_band
 from beacon_comm.core.index_image import hop_length_ns
 from beacon_comm.core.nearest import CELL_SHIFT, cell_lists, cells_along
 from beacon_comm.core.parameters import Parameters
@@ -59,7 +59,7 @@ class Router:
         self._grid = PixelGrid(*sensor_size)
         self._hop_ns = hop_length_ns(parameters)
         self._factor, self._margin = parameters.routing_extent_factor, parameters.routing_margin_px
-        self._word, self._offset_ns = np.empty(_FIRST_ROOM, np.uint32), np.empty(_FIRST_ROOM, np.uint32)
+        self._code, self._offset_ns = np.empty(_FIRST_ROOM, np.uint32), np.empty(_FIRST_ROOM, np.uint32)
         self._index, self._owner = np.empty(_FIRST_ROOM, np.int32), np.empty(_FIRST_ROOM, np.int32)
         self._in_band = np.zeros(self._grid.bands, np.int64)
         self._gathered = 0
@@ -89,16 +89,16 @@ class Router:
             return []
         segment = self._on_sensor(segment)
         n, start = len(segment), self._gathered
-        if start + n > len(self._word):
+        if start + n > len(self._code):
             self._make_room(n)
         self._gathered += n
-        word = self._word[start : start + n]
+        code = self._code[start : start + n]
         _pack(
             segment.x, segment.y, segment.polarity, segment.t_ns, self._grid.shift, self._t_hop_ns,
-            word, self._offset_ns[start : start + n],
+            code, self._offset_ns[start : start + n],
         )  # fmt: skip
-        _count_bands(word, self._in_band)
-        return self._own(segment, word) if self._track_ids else []
+        _count_bands(code, self._in_band)
+        return self._own(segment, code) if self._track_ids else []
 
     def _on_sensor(self, segment: EventBatch) -> EventBatch:
         """Return the segment without the events beyond the sensor's borders."""
@@ -112,12 +112,12 @@ class Router:
             segment.x[kept], segment.y[kept], segment.polarity[kept], segment.t_ns[kept], segment.t_end_ns
         )
 
-    def _own(self, segment: EventBatch, word: NDArray[np.uint32]) -> list[Routed]:
-        """Return each track's events, and flag them in ``word``."""
+    def _own(self, segment: EventBatch, code: NDArray[np.uint32]) -> list[Routed]:
+        """Return each track's events, and flag them in ``code``."""
         count = np.zeros(len(self._track_ids) + 1, np.int64)
         routed = _find_owners(
             segment.x, segment.y, segment.t_ns, self._t_hop_ns, self._circle, self._first, self._member,
-            cells_along(self._grid.width), self._index, self._owner, word, count[1:],
+            cells_along(self._grid.width), self._index, self._owner, code, count[1:],
         )  # fmt: skip
         if routed == 0:
             return []
@@ -134,16 +134,16 @@ class Router:
     def close(self) -> HopEvents:
         """Return the events gathered in the hop interval, and begin the next one."""
         n, self._gathered = self._gathered, 0
-        events = sorted_by_band(self._word[:n], self._offset_ns[:n], self._in_band, self._t_hop_ns)
+        events = sorted_by_band(self._code[:n], self._offset_ns[:n], self._in_band, self._t_hop_ns)
         self._in_band[:] = 0
         return events
 
     def _make_room(self, n: int) -> None:
         room = 2 * (self._gathered + n)
-        word, offset_ns, kept = self._word, self._offset_ns, self._gathered
-        self._word, self._offset_ns = np.empty(room, np.uint32), np.empty(room, np.uint32)
+        code, offset_ns, kept = self._code, self._offset_ns, self._gathered
+        self._code, self._offset_ns = np.empty(room, np.uint32), np.empty(room, np.uint32)
         self._index, self._owner = np.empty(room, np.int32), np.empty(room, np.int32)
-        self._word[:kept], self._offset_ns[:kept] = word[:kept], offset_ns[:kept]
+        self._code[:kept], self._offset_ns[:kept] = code[:kept], offset_ns[:kept]
 
 
 @njit(cache=True, nogil=True)
@@ -155,23 +155,23 @@ def _count_outside(x, y, width, height):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _pack(x, y, polarity, t_ns, shift, t_hop_ns, word, offset_ns):  # type: ignore[no-untyped-def]
-    """Write each event's word, and its time since the hop's begin."""
+def _pack(x, y, polarity, t_ns, shift, t_hop_ns, code, offset_ns):  # type: ignore[no-untyped-def]
+    """Write each event's code, and its time since the hop's begin."""
     for i in range(len(x)):
         pixel = (np.uint32(y[i]) << np.uint32(shift)) | np.uint32(x[i])
-        word[i] = (pixel << np.uint32(CODE_BITS)) | np.uint32(polarity[i] > 0)
+        code[i] = (pixel << np.uint32(CODE_BITS)) | np.uint32(polarity[i] > 0)
         offset_ns[i] = t_ns[i] - t_hop_ns
 
 
 @njit(cache=True, nogil=True)
-def _count_bands(word, in_band):  # type: ignore[no-untyped-def]
-    for i in range(len(word)):
-        in_band[word[i] >> np.uint32(16)] += 1
+def _count_bands(code, in_band):  # type: ignore[no-untyped-def]
+    for i in range(len(code)):
+        in_band[band_of(code[i])] += 1
 
 
 @njit(cache=True, nogil=True)
 def _find_owners(  # type: ignore[no-untyped-def]
-    x, y, t_ns, t_hop_ns, circle, first, member, cells_across, index, owner, word, count
+    x, y, t_ns, t_hop_ns, circle, first, member, cells_across, index, owner, code, count
 ):
     """List the events that are of a track, with their tracks, and count them by track; return how many.
 
@@ -184,11 +184,11 @@ def _find_owners(  # type: ignore[no-untyped-def]
         near += np.uint64(first[cell] != first[cell + np.uint64(1)])
     routed = np.uint64(0)
     for j in range(near):
-        i = np.uint64(index[j])
-        cell = _cell(x[i], y[i], cells_across)
-        ex, ey, dt_ns = np.int64(x[i]), np.int64(y[i]), t_ns[i] - t_hop_ns
+        e = np.uint64(index[j])
+        cell = _cell(x[e], y[e], cells_across)
+        ex, ey, dt_ns = np.int64(x[e]), np.int64(y[e]), t_ns[e] - t_hop_ns
         nearest2 = np.inf
-        best = -1
+        best = np.int64(-1)
         for at in range(np.uint64(first[cell]), np.uint64(first[cell + np.uint64(1)])):
             k = np.uint64(member[at])
             dx = ex - (circle[k, 0] + circle[k, 2] * dt_ns)
@@ -198,8 +198,8 @@ def _find_owners(  # type: ignore[no-untyped-def]
                 nearest2 = d2
                 best = np.int64(k)
         if best >= 0:
-            word[i] |= np.uint32(ROUTED)
-            index[routed] = i
+            code[e] |= np.uint32(ROUTED)
+            index[routed] = e
             owner[routed] = best
             count[best] += 1
             routed += np.uint64(1)
