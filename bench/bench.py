@@ -232,7 +232,7 @@ def scaling(folder: Path) -> MetricTable:
     metrics: MetricTable = {}
     head(
         'How the cost grows (receiver: threshold)', 'sensor', 'background Mev/s', 'beacons', 'Mev/s in all',
-        'decoding and detection ns an event', 'all, ms a hop', 'demodulation ms a hop and beacon', 'confirmed',
+        'decoding and detection ns an event', 'all, ms a hop', 'demodulation ms a hop and track', 'confirmed',
     )  # fmt: skip
     for size, name in ((VGA, 'vga'), (HD, 'hd')):
         for rate in SCALING_RATES:
@@ -245,11 +245,11 @@ def scaling(folder: Path) -> MetricTable:
                 key = f'scaling_{name}_{rate / 1e6:g}mev_{count}_beacons'
                 metrics[f'{key}_ns_per_event'] = (run.decode_s + run.detect_s) / run.events * 1e9
                 metrics[f'{key}_ms_per_hop'] = run.total_s / hop_count * 1e3
-                metrics[f'{key}_demodulation_ms_per_hop_and_beacon'] = run.demodulate_s / hop_count / count * 1e3
+                metrics[f'{key}_demodulation_ms_per_hop_and_track'] = run.demodulate_s / hop_count / max(run.tracks, 1) * 1e3
                 row(
                     f'{size[0]} x {size[1]}', rate / 1e6, count, stream.events / stream.seconds / 1e6,
                     metrics[f'{key}_ns_per_event'], metrics[f'{key}_ms_per_hop'],
-                    metrics[f'{key}_demodulation_ms_per_hop_and_beacon'], run.confirmed,
+                    metrics[f'{key}_demodulation_ms_per_hop_and_track'], run.confirmed,
                 )  # fmt: skip
     return metrics
 
@@ -270,12 +270,12 @@ def draw(metrics: MetricTable, path: Path) -> None:
             left.plot(rates, values, style, color=colour, marker='o', label=f'{count} beacons, {label}')
         for rate, colour in zip(rates, ('tab:red', 'tab:purple', 'tab:brown'), strict=True):
             keys = [f'scaling_{name}_{rate:g}mev_{count}_beacons' for count in SCALING_BEACONS]
-            values = [metrics[f'{key}_demodulation_ms_per_hop_and_beacon'] for key in keys]
+            values = [metrics[f'{key}_demodulation_ms_per_hop_and_track'] for key in keys]
             right.plot(SCALING_BEACONS, values, style, color=colour, marker='o', label=f'{rate:g} Mev/s, {label}')
     left.axhline(10, color='0.6', linewidth=1)
     left.text(rates[0], 10.3, 'real time: a hop is 10 ms', color='0.4', fontsize=8)
     left.set(xlabel='background (million events a second)', ylabel='processor time a hop (ms)', title='Bytes to characters')
-    right.set(xlabel='beacons', ylabel='demodulation, ms a hop and beacon', title='What one more beacon costs', xscale='log')
+    right.set(xlabel='beacons', ylabel='demodulation, ms a hop and track', title='What one more track costs', xscale='log')
     right.set_xticks(SCALING_BEACONS, [str(count) for count in SCALING_BEACONS])
     right.minorticks_off()
     for axes in (left, right):

@@ -107,27 +107,34 @@ def _close(low, side, width, wide, closed):  # type: ignore[no-untyped-def]
     before, after = side // 2, side - 1 - side // 2
     last = _ALL >> np.uint64(-width & 63)  # the pixels of a row's last word
     spread = np.empty(words, np.uint64)
+    filled = np.empty(height, np.bool_)
     for y in range(height):
         _widen(low[y, :words], before, after, wide[y])
         wide[y, -1] &= last
+        filled[y] = _has_any(wide[y])
     for y in range(height):
         # Set pixels of the rows y - after … y + before reach this one.
+        from_row, to_row = max(y - after, 0), min(y + before, height - 1)
+        near = False
+        for other in range(from_row, to_row + 1):
+            near |= filled[other]
+        if not near:
+            closed[y, :] = _NONE
+            continue
         spread[:] = _NONE
-        for other in range(max(y - after, 0), min(y + before, height - 1) + 1):
+        for other in range(from_row, to_row + 1):
             for k in range(words):
                 spread[k] |= wide[other, k]
         _narrow(spread, before, after, last, closed[y])
     for y in range(height):
-        # It stays where the rows y - before … y + after are set; those above must not have lost theirs yet.
-        for k in range(words):
-            wide[y, k] = closed[y, k]
-        if _has_any(closed[y]):
+        filled[y] = _has_any(closed[y])
+        wide[y, :] = closed[y]
+    for y in range(height):
+        # It stays where the rows y - before … y + after, as they were, are set.
+        if filled[y]:
             for other in range(max(y - before, 0), min(y + after, height - 1) + 1):
                 for k in range(words):
-                    wide[y, k] &= closed[other, k]
-    for y in range(height):
-        for k in range(words):
-            closed[y, k] = wide[y, k]
+                    closed[y, k] &= wide[other, k]
 
 
 @njit(cache=True, nogil=True)
