@@ -275,7 +275,8 @@ def draw(metrics: MetricTable, path: Path) -> None:
     left.axhline(10, color='0.6', linewidth=1)
     left.text(rates[0], 10.3, 'real time: a hop is 10 ms', color='0.4', fontsize=8)
     left.set(xlabel='background (million events a second)', ylabel='processor time a hop (ms)', title='Bytes to characters')
-    right.set(xlabel='beacons', ylabel='demodulation, ms a hop and track', title='What one more track costs', xscale='log')
+    right.set(xlabel='beacons', ylabel='demodulation, ms a hop and track', xscale='log')
+    right.set_title('What one more track costs its demodulator')
     right.set_xticks(SCALING_BEACONS, [str(count) for count in SCALING_BEACONS])
     right.minorticks_off()
     for axes in (left, right):
