@@ -248,7 +248,8 @@ def test_a_beacon_among_more_lamps_than_tracks_has_its_turn() -> None:
     beacon = on_disc(simulate_text(TEXT * 9, 3125.0, t0_ns=500_000_000, model=STEADY, seed=1), still(80, 100))
     parameters = Parameters(bit_rates=(3125.0,), rate_search='listed', max_tracks=4, candidate_slots=2, starved_after_s=0.2)
     receiver = Receiver(parameters, SIZE)
-    outputs = [receiver.push(part) for part in pieces(merged(*lamps, beacon), list(range(0, 2_000_000, 50_000)))]
+    events = merged(*lamps, beacon)
+    outputs = [receiver.push(part) for part in pieces(events, list(range(0, len(events), 50_000)))]
     assert TEXT in text_of(outputs)
     (confirmed,) = [one for one in receiver.beacons() if one.state is BeaconState.CONFIRMED]
     assert (confirmed.x_px, confirmed.y_px) == pytest.approx((80.0, 100.0), abs=2.0)
