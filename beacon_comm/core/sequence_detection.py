@@ -341,7 +341,7 @@ def _decide(clock, state, transitions, layout, best, lag, rows, count):  # type:
             count += 1
     elif state.noises[best] >> lag & 1:
         clock.frozen[0] = True
-        if not state.silent[at & _RING_MASK]:  # silence is not in doubt
+        if state.silent[at & _RING_MASK] == HEARD:  # silence is not in doubt
             numbers[NOISE_RUN] += 1
             numbers[DOUBT] += 1
             if numbers[NOISE_RUN] == length:
@@ -357,7 +357,8 @@ def _decide(clock, state, transitions, layout, best, lag, rows, count):  # type:
     else:
         numbers[NOISE_RUN] = 0
         # Idle where the events say 0: a lock whose clock has slipped may read an idle line for ever.
-        numbers[DOUBT] += not state.free_bits[np.argmax(state.free_metric)] >> lag & 1
+        if state.silent[at & _RING_MASK] == HEARD:
+            numbers[DOUBT] += not state.free_bits[np.argmax(state.free_metric)] >> lag & 1
     return count
 
 
