@@ -1,12 +1,15 @@
-"""The events of one track: those of the last ``buffer_s``, in order of time.
+"""Events in order of time that come at the end and go at the beginning; and those of one track's last ``buffer_s``.
 
-    t_ns      [ free | live events ……………………… | room ]
+    times     [ free | live events ……………………… | room ]
     polarity  [ free | live events ……………………… | room ]       one array each, moved down or doubled when full
 
-What is too old or too much is decided at hops alone and by event time, so that any batching leaves the same events.
+In a track's buffer, what is too old or too much is decided at hops alone and by event time, so that any batching
+leaves the same events.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +22,56 @@ EVENT_BYTES = 9  # int64 time and int8 polarity
 _FIRST_ROOM = 256
 
 
-class EventBuffer:
+class EventArrays:
+    """Times and polarities of events.
+
+    Args:
+        time_type: of the times.
+    """
+
+    def __init__(self, time_type: type[np.int64] | type[np.float64]) -> None:
+        self._times = np.empty(_FIRST_ROOM, time_type)
+        self._polarity = np.empty(_FIRST_ROOM, np.int8)
+        self._start = 0
+        self._stop = 0
+
+    def __len__(self) -> int:
+        return self._stop - self._start
+
+    @property
+    def times(self) -> NDArray[Any]:
+        """View of the times, ``(n,)``; good until events are appended."""
+        return self._times[self._start : self._stop]
+
+    @property
+    def polarity(self) -> NDArray[np.int8]:
+        """View of the polarities, ``(n,)`` of ±1; good until events are appended."""
+        return self._polarity[self._start : self._stop]
+
+    def append(self, times: NDArray[Any], polarity: NDArray[np.int8]) -> None:
+        """Copy events to the end; they must not be older than those before."""
+        n = len(times)
+        if self._stop + n > len(self._times):
+            self._make_room(n)
+        self._times[self._stop : self._stop + n] = times
+        self._polarity[self._stop : self._stop + n] = polarity
+        self._stop += n
+
+    def drop(self, count: int) -> None:
+        """Let the first events go."""
+        self._start += count
+
+    def _make_room(self, n: int) -> None:
+        times, polarity, kept = self.times, self.polarity, len(self)
+        if 2 * (kept + n) > len(self._times):
+            room = 2 * (kept + n)
+            self._times, self._polarity = np.empty(room, times.dtype), np.empty(room, np.int8)
+        self._times[:kept] = times
+        self._polarity[:kept] = polarity
+        self._start, self._stop = 0, kept
+
+
+class EventBuffer(EventArrays):
     """Routed events of one track.
 
     Args:
@@ -31,27 +83,11 @@ class EventBuffer:
     """
 
     def __init__(self, length_ns: int, max_bytes: int) -> None:
+        super().__init__(np.int64)
         self._length_ns = length_ns
         self._max_events = max(1, max_bytes // EVENT_BYTES)
-        self._t_ns = np.empty(_FIRST_ROOM, np.int64)
-        self._polarity = np.empty(_FIRST_ROOM, np.int8)
-        self._start = 0
-        self._stop = 0
         self._oldest_ns = np.iinfo(np.int64).min
         self.overflow_events = 0
-
-    def __len__(self) -> int:
-        """Return how many events are held; some may be too old already."""
-        return self._stop - self._start
-
-    def append(self, t_ns: NDArray[np.int64], polarity: NDArray[np.int8]) -> None:
-        """Copy events to the end; they must not be older than those before."""
-        n = len(t_ns)
-        if self._stop + n > len(self._t_ns):
-            self._make_room(n)
-        self._t_ns[self._stop : self._stop + n] = t_ns
-        self._polarity[self._stop : self._stop + n] = polarity
-        self._stop += n
 
     def trim(self, t_hop_ns: int) -> int:
         """Let go what is too old at ``t_hop_ns`` (ns) or too much; return how many events were too much."""
@@ -60,30 +96,23 @@ class EventBuffer:
             return 0  # what is too old goes when it is in the way
         self._drop_old()
         excess = max(0, len(self) - self._max_events)
-        self._start += excess
+        self.drop(excess)
         self.overflow_events += excess
         return excess
 
     def events(self) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
         """Return copies of the times (ns), ``(n,)`` int64, and polarities, ``(n,)`` int8 of ±1."""
         self._drop_old()
-        live = slice(self._start, self._stop)
-        return self._t_ns[live].copy(), self._polarity[live].copy()
+        return self.times.copy(), self.polarity.copy()
 
     def _drop_old(self) -> None:
-        if self._start < self._stop and self._t_ns[self._start] < self._oldest_ns:
-            self._start += int(np.searchsorted(self._t_ns[self._start : self._stop], self._oldest_ns))
+        times = self.times
+        if len(times) and times[0] < self._oldest_ns:
+            self.drop(int(np.searchsorted(times, self._oldest_ns)))
 
     def _make_room(self, n: int) -> None:
         self._drop_old()
-        live = slice(self._start, self._stop)
-        t_ns, polarity, kept = self._t_ns, self._polarity, len(self)
-        if 2 * (kept + n) > len(t_ns):
-            room = 2 * (kept + n)
-            self._t_ns, self._polarity = np.empty(room, np.int64), np.empty(room, np.int8)
-        self._t_ns[:kept] = t_ns[live]
-        self._polarity[:kept] = polarity[live]
-        self._start, self._stop = 0, kept
+        super()._make_room(n)
 
 
 def buffer_length_ns(parameters: Parameters) -> int:

@@ -71,10 +71,8 @@ SHORT_WINDOW, LONG_WINDOW, LONGEST_WINDOW = 8, 25, 90
 EXHAUSTED_AT = 60
 """Nothing found in so many characters: there is no such beacon."""
 
-READ_BACK_CHARACTERS = 100
-"""What was said before a lock is read from the buffer, so many characters back at most."""
-
-KEPT_CHARACTERS = READ_BACK_CHARACTERS + LONG_WINDOW + 5
+KEPT_CHARACTERS = 130
+"""Events so many characters of the slowest rate back are kept while it is sought."""
 
 LISTED_DEMANDS = Demands(needed=4)
 BLIND_DEMANDS = Demands(needed=8, tried=1, least_changes=FEW_CHANGES, most_stray=0.1)

@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from beacon_comm.core.acquisition import Demands, Lock, acquire
 from beacon_comm.core.bit_clock import BORDER, P_CROSS, P_PERIOD, P_PHASE, PERIOD
 from beacon_comm.core.character import Character, Status
-from beacon_comm.core.event_buffer import EVENT_BYTES
+from beacon_comm.core.event_buffer import EVENT_BYTES, EventArrays
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.likelihood import MEMORY_BITS, compression_table
 from beacon_comm.core.parameters import Parameters
-from beacon_comm.core.rate_search import READ_BACK_CHARACTERS, RateSearch, make_searches
+from beacon_comm.core.rate_search import RateSearch, make_searches
 from beacon_comm.core.sequence_detection import (
     BORDER_OF_START,
     FIRST_RATIO,
@@ -60,6 +60,9 @@ REFINED_PERIODS: NDArray[np.float64] = 1.0 + 0.001 * np.arange(-8.0, 9.0)
 
 REFINED_DEMANDS = Demands(REFINED_AFTER // 2, most_spread=math.inf)
 
+READ_BACK_CHARACTERS, REREAD_CHARACTERS = 400, 100
+"""What was said before a lock is read from the buffer, so many characters back at most; after a lost lock, so many."""
+
 _ROWS = 512
 
 
@@ -77,6 +80,7 @@ class SequenceDemodulator:
         self._decode = self._frame.decoding_table()
         self._compression = compression_table()
         self._searches: list[RateSearch] = make_searches(parameters, self._frame)
+        self._longest = max(search.longest for search in self._searches)
         self._most_events = parameters.buffer_max_bytes // EVENT_BYTES
         self._rows = np.zeros((_ROWS, FIRST_RATIO + self._frame.length))
         self._lock: Lock | None = None
@@ -84,14 +88,22 @@ class SequenceDemodulator:
         self._pending: Character | None = None  # said before the lock is trusted
         self._trusted = False  # the lock has seen a character that is ok, or nearly
         self._origin_ns: int | None = None
-        self._t = np.empty(0, np.float64)
-        self._polarity = np.empty(0, np.int8)
+        self._events = EventArrays(np.float64)
         self._gaps = np.empty((0, 2))  # whose events are missing
         self._known_to = -math.inf  # the stream's time
         self._taken = 0  # events of the buffer that the lock has seen
         self._given_to = -math.inf  # end of the last character that was given out
         self._refine_at = math.inf  # time at which the lock is to be refined
         self._usable_from = -math.inf  # events before this are not read again
+
+    @property
+    def _t(self) -> NDArray[np.float64]:
+        """Times of the buffered events (ns from the origin)."""
+        return self._events.times
+
+    @property
+    def _polarity(self) -> NDArray[np.int8]:
+        return self._events.polarity
 
     @property
     def bit_rate_bps(self) -> float | None:
@@ -121,8 +133,7 @@ class SequenceDemodulator:
             self._origin_ns = int(t_ns[0])
             self._restart(0.0)
         self._ended = None
-        self._t = np.concatenate((self._t, (t_ns - self._origin_ns).astype(np.float64)))
-        self._polarity = np.concatenate((self._polarity, polarity))
+        self._events.append(t_ns - self._origin_ns, polarity)
         t_end = float(t_end_ns - self._origin_ns)
         if len(t_ns):
             for search in self._searches:
@@ -210,7 +221,7 @@ class SequenceDemodulator:
     def _unlock(self) -> None:
         assert self._lock is not None
         lost_at = float(self._lock.clock.values[BORDER])
-        self._usable_from = max(self._given_to, lost_at - self._read_back(self._lock))
+        self._usable_from = max(self._given_to, lost_at - self._reread(self._lock))
         self._lock = None
         self._refine_at = math.inf
         self._taken = 0
@@ -274,7 +285,7 @@ class SequenceDemodulator:
         lock = self._choose(search, now, first, stop, self._look(search, window))
         search.failed()
         if lock is not None:
-            self._start(lock, first)
+            self._start(lock, first, now)
         return True
 
     def _attempt_all(self) -> None:
@@ -287,7 +298,7 @@ class SequenceDemodulator:
             if lock is not None:
                 locks.append(lock)
         if locks:
-            self._start(max(locks, key=lambda lock: lock.verdict.merit), first)
+            self._start(max(locks, key=lambda lock: lock.verdict.merit), first, self._known_to)
             self._refine_at = math.inf
 
     def _look(self, search: RateSearch, window: slice) -> Lock | None:
@@ -324,14 +335,15 @@ class SequenceDemodulator:
         others = [self._look(search, w) for search, w in zip(slower, windows, strict=True) if w is not None]
         return max([lock, *(other for other in others if other is not None)], key=lambda lock: lock.verdict.merit)
 
-    def _start(self, lock: Lock, first: int) -> None:
-        """Follow a lock from the buffer's beginning on."""
+    def _start(self, lock: Lock, first: int, now: float) -> None:
+        """Follow a lock that was found at the time ``now`` (ns) from the buffer's beginning on."""
         border = float(lock.clock.values[BORDER])
         self._trusted = False
         self._refine_at = border + REFINED_AFTER * self._frame.length * lock.period
         if len(lock.positions) > (REFINED_AFTER - 5) * self._frame.length:
             self._refine_at = math.inf
-        self._begin(lock, max(float(self._t[first]), border - self._read_back(lock)))
+        kept = min(self._longest, READ_BACK_CHARACTERS * self._frame.length * lock.period)
+        self._begin(lock, max(float(self._t[first]), now - kept))
 
     def _begin(self, lock: Lock, t: float) -> None:
         """Follow a lock from about the time ``t`` (ns) on."""
@@ -357,18 +369,17 @@ class SequenceDemodulator:
     def _forget(self, t_end: float) -> None:
         """Drop the events that nothing can need any more."""
         if self._lock is not None:
-            needed_from = max(self._given_to, t_end - self._read_back(self._lock))
+            needed_from = max(self._given_to, t_end - self._reread(self._lock))
             if self._refine_at < math.inf:
                 needed_from = min(needed_from, self._refine_at - 2.0 * REFINED_AFTER * self._frame.length * self._lock.period)
             first = min(self._taken, int(np.searchsorted(self._t, needed_from)))
         else:
-            needed_from = t_end - max(search.longest for search in self._searches)
+            needed_from = t_end - self._longest
             first = max(int(np.searchsorted(self._t, needed_from)), len(self._t) - self._most_events)
         if len(self._gaps):
             self._gaps = self._gaps[self._gaps[:, 1] > needed_from]
-        if first > len(self._t) // 2:
-            self._t, self._polarity = self._t[first:].copy(), self._polarity[first:].copy()
-            self._taken -= first
+        self._events.drop(first)
+        self._taken -= first
 
-    def _read_back(self, lock: Lock) -> float:
-        return READ_BACK_CHARACTERS * self._frame.length * lock.period
+    def _reread(self, lock: Lock) -> float:
+        return REREAD_CHARACTERS * self._frame.length * lock.period
