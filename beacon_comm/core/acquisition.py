@@ -50,10 +50,7 @@ LONG_WORDS, LONG_FAILING, LONG_MARGIN = 12, 0.5, 35.0
 """… or with so many passing words, where more of them may fail (a weak signal), but none other is nearly as likely."""
 
 FULL_WORDS, FULL_SHARE = 4, 0.6
-"""So many words that pass over so much of a window leave no room for another rate."""
-
-PLACE_MARGIN = 6.0
-"""The frame's place among the bits must be so much more likely (nat) than any other: a few letters may fit two places."""
+"""So many words that pass over so much of a window, or whose edges are sharp, leave no room for another rate."""
 
 OVERSAMPLED_SHARE = 0.9
 """If so many changes of level lie on every second bit, or on every third, the bits are longer than was thought."""
@@ -74,6 +71,9 @@ NEIGHBOURS = 2
 
 LEAST_PERIOD_STD = 1e-5
 """No window says more about a period (share)."""
+
+MOST_STRETCH = 0.1
+"""The first edges correct a period by no more than this (share)."""
 
 LEAST_EDGES = 6
 """Fewer edges say nothing about the grid."""
@@ -388,7 +388,8 @@ def _stretch(t, polarity, start, period):  # type: ignore[no-untyped-def]
             if rising[i] == (kind == 0):
                 off[i] = edges[i] - late - np.floor(edges[i] - late + 0.5)
     xx = (from_middle * from_middle).sum()
-    return (from_middle * off).sum() / xx if xx > 0.0 else 0.0
+    stretch = (from_middle * off).sum() / xx if xx > 0.0 else 0.0
+    return min(max(stretch, -MOST_STRETCH), MOST_STRETCH)
 
 
 class Edges(NamedTuple):

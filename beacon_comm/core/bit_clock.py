@@ -1,8 +1,8 @@
 """The bit clock: where bits begin, followed on the edges, and the events of each bit counted in its sub-slots.
 
 Where the decided bits change, an *edge* is located: the events after it are of one polarity, those before of the other or
-of both, so that the sum of the signed events, less half of what a burst adds in the time, is least (to OFF: greatest) at
-the edge.  Background events, as many of either polarity, hardly move that.
+of both, so that the sum of the signed events, less the burst's own spread evenly over a bit, is least (to OFF: greatest)
+at the edge.  Background events, as many of either polarity, hardly move that.
 
 Each polarity has its own mean latency behind the border of the bit.  What an edge lies off border and latency is the
 measurement of a Kalman filter with two states, phase and period of the clock::
@@ -33,7 +33,7 @@ FINE = 32
 """Bins of a bit in which an edge is located."""
 
 UNSURE_PHASE, EDGE_RUN, SUDDEN = 0.08, 4, 0.3
-"""A phase less sure than this (bit) after a long idle line is set by the next fall, before the bits behind it are counted:
+"""A phase less sure than this (bit), as after a long idle line, is set by the next fall, before the bits behind it are counted:
 the first of so many OFF events in a row, in a time in which so many OFF events at most were to be expected."""
 
 RISE_DEVIATIONS = 2.0
@@ -147,7 +147,9 @@ def take_events(clock, t, polarity, first, sign):  # type: ignore[no-untyped-def
     values, counts, signed = clock.values, clock.counts, clock.signed[-1]
     border, per_bin = values[BORDER], FINE / values[PERIOD]
     stop = border + values[PERIOD]
-    unsure = values[P_PHASE] > UNSURE_PHASE * UNSURE_PHASE and not clock.frozen[0]
+    unsure = _unsure(clock)
+    if not unsure:
+        clock.run[0] = 0
     i = first
     while i < len(t):
         at = t[i]
@@ -155,7 +157,7 @@ def take_events(clock, t, polarity, first, sign):  # type: ignore[no-untyped-def
             break
         here = sign * polarity[i]
         if unsure and _falls(clock, at, here):
-            unsure = False
+            unsure = _unsure(clock)
             border = values[BORDER]
             stop = border + values[PERIOD]
         place = min(max(int((at - border) * per_bin), 0), FINE - 1)
@@ -165,6 +167,11 @@ def take_events(clock, t, polarity, first, sign):  # type: ignore[no-untyped-def
         i += 1
     clock.events[-1] += i - first
     return i
+
+
+@njit(cache=True, nogil=True)
+def _unsure(clock):  # type: ignore[no-untyped-def]
+    return clock.values[P_PHASE] > UNSURE_PHASE * UNSURE_PHASE and not clock.frozen[0]
 
 
 @njit(cache=True, nogil=True)
@@ -187,6 +194,7 @@ def _falls(clock, at, polarity):  # type: ignore[no-untyped-def]
     _follow(values, clock.latencies, OFF, off - math.floor(off + 0.5))
     values[BORDER] += values[SHIFT]
     values[SHIFT] = 0.0
+    clock.signed[-1] = 0  # on the old grid: this edge has been seen
     return True
 
 
@@ -222,8 +230,8 @@ def see_edge(clock, to):  # type: ignore[no-untyped-def]
         level += up * clock.signed[k // FINE, k % FINE] - rise / FINE
     if at == begin:
         return
-    since = clock.shifts[-1]
-    for row in range(2, EDGE_LAG + 1):
+    since = 0.0  # how much the borders behind the edge have been corrected
+    for row in range(max(at // FINE, 1) + 1, EDGE_LAG + 2):
         since += clock.shifts[row]
     residual = (at + 0.5) / FINE - 1.0 - late - since / values[PERIOD]
     deviations = residual / math.sqrt(values[P_PHASE] + values[VARIANCE])
@@ -239,8 +247,8 @@ def _follow(values, latencies, to, residual):  # type: ignore[no-untyped-def]
     variance = values[VARIANCE]
     innovation = values[P_PHASE] + variance
     gain, gain_period = values[P_PHASE] / innovation, values[P_CROSS] / innovation
-    values[SHIFT] = gain * residual * values[PERIOD]
-    values[STRETCH] = gain_period * residual
+    values[SHIFT] += gain * residual * values[PERIOD]
+    values[STRETCH] += gain_period * residual
     values[P_PERIOD] -= gain_period * values[P_CROSS]
     values[P_CROSS] *= 1.0 - gain
     values[P_PHASE] *= 1.0 - gain

@@ -185,7 +185,7 @@ class OctaveSearch(RateSearch):
         for period in named:
             if all(abs(period / other - 1.0) > NAMED_SPREAD for other in tried):
                 tried.append(float(period))
-                yield periods_around(float(period))
+                yield periods_around(float(period), NAMED_SPREAD, (t[-1] - t[0]) / float(period))
 
     def _repeated(self, signed: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return bit periods (bins) from the autocorrelation, the best first."""

@@ -339,6 +339,7 @@ class SequenceDemodulator:
         """Follow a lock that was found at the time ``now`` (ns) from the buffer's beginning on."""
         border = float(lock.clock.values[BORDER])
         self._trusted = False
+        self._pending = None
         self._refine_at = border + REFINED_AFTER * self._frame.length * lock.period
         if len(lock.positions) > (REFINED_AFTER - 5) * self._frame.length:
             self._refine_at = math.inf
@@ -364,7 +365,6 @@ class SequenceDemodulator:
         start_at(lock.detection, place, length)
         self._taken = int(np.searchsorted(self._t, t))  # what lies before may be gone from the buffer
         self._lock = lock
-        self._pending = None
 
     def _forget(self, t_end: float) -> None:
         """Drop the events that nothing can need any more."""

@@ -225,9 +225,8 @@ def detect(  # type: ignore[no-untyped-def]
             if i == len(t):
                 return count, i, STILL_LOCKED
             _wake(clock, state, transitions, t[i])
-        border = values[BORDER] + values[PERIOD]
         i = take_events(clock, t, polarity, i, sign)
-        if i == len(t) and t_end < border:
+        if i == len(t) and t_end < values[BORDER] + values[PERIOD]:
             return count, i, STILL_LOCKED
         count = _close_bit(clock, state, transitions, layout, gaps, rows, count)
         go_on(clock, 1)
@@ -245,6 +244,7 @@ def _wake(clock, state, transitions, t):  # type: ignore[no-untyped-def]
     if skipped > 0.0:
         go_on(clock, skipped)
     clock.frozen[0] = False
+    clock.run[0] = 0
     length = transitions.length
     state.metric[:] = UNLIKELY
     state.metric[length * 2 * CONTEXTS + CONTEXTS - 1] = 0.0
@@ -460,11 +460,11 @@ def _learn_word(state, contexts, first):  # type: ignore[no-untyped-def]
     seen, expected = 0.0, 0.0
     for k in range(len(contexts)):
         context, place = contexts[k], (first + k) & _RING_MASK
-        if silent[place] == MISSING:
+        if silent[place] == MISSING or _in_gap(state, first + k):
             continue
         levels[SILENCE] += (silent[place] - levels[SILENCE]) / (LEARNING_MEMORY * len(contexts))
         if context == 0 or context == CONTEXTS - 1:
-            levels[EMPTY] += ((totals[place] == 0.0) - levels[EMPTY]) / LEARNING_MEMORY
+            levels[EMPTY] += ((totals[place] == 0.0) - levels[EMPTY]) / (LEARNING_MEMORY * len(contexts))
         if silent[place] and levels[SILENCE] < RARELY_SILENT:
             continue
         learn(histograms, counts[place], context, 1.0)
