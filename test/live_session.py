@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from beacon_comm.core.bearing import CameraModel
 from beacon_comm.core.character import Status
@@ -27,9 +28,16 @@ TEXT = 2 * "Shall I compare thee to a summer's day?\n"
 
 
 def beacon_events(text: str = TEXT, start_ns: int = START_NS, bit_rate: float = BIT_RATE) -> EventBatch:
-    """Return a beacon's events: at every edge each pixel of a square fires once; time ends with the last of them."""
-    edges_ns, levels = transitions(CharacterFrame().encode_bits(text), bit_rate, start_ns)
+    """Return the events of a beacon that covers a square of pixels."""
     columns, rows = (grid.ravel() for grid in np.meshgrid(np.arange(20, 27), np.arange(10, 17)))
+    return pixel_events(text, start_ns, bit_rate, columns, rows)
+
+
+def pixel_events(
+    text: str, start_ns: int, bit_rate: float, columns: NDArray[np.int64], rows: NDArray[np.int64]
+) -> EventBatch:
+    """Return a beacon's events: at every edge each of its pixels fires once; time ends with the last of them."""
+    edges_ns, levels = transitions(CharacterFrame().encode_bits(text), bit_rate, start_ns)
     pixels = len(columns)
     t_ns = (edges_ns[:, None] + np.linspace(20_000, 120_000, pixels)).astype(np.int64) // 1000 * 1000
     return EventBatch(

@@ -16,13 +16,13 @@ messages = pytest.importorskip('beacon_comm.msg')
 EventPacket = pytest.importorskip('event_camera_msgs.msg').EventPacket
 
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from live_session import pixel_events  # noqa: E402
 from node_process import DOMAIN, START_TIMEOUT_S, NodeProcess, Peer  # noqa: E402
 from rclpy.qos import ReliabilityPolicy  # noqa: E402
 from sensor_msgs.msg import CameraInfo  # noqa: E402
 
 from beacon_comm.core.character import Status  # noqa: E402
 from beacon_comm.core.events import NS_PER_S, EventBatch  # noqa: E402
-from beacon_comm.core.framing import CharacterFrame, transitions  # noqa: E402
 from beacon_comm.wire.cdr import build_event_packet  # noqa: E402
 from beacon_comm.wire.evt3_encoder import Evt3Encoder  # noqa: E402
 
@@ -36,20 +36,10 @@ TEXT = "Shall I compare thee to a summer's day?\n"
 
 
 def beacon_events(text: str, start_ns: int, x_px: int, y_px: int) -> EventBatch:
-    """Return a beacon's events: at every edge each pixel of a disc fires once; time ends with the last of them."""
-    edges_ns, levels = transitions(CharacterFrame().encode_bits(text), BIT_RATE, start_ns)
+    """Return the events of a beacon that covers a disc of pixels."""
     columns, rows = np.meshgrid(np.arange(-4, 5), np.arange(-4, 5))
     disc = columns**2 + rows**2 <= 16
-    x, y = columns[disc] + x_px, rows[disc] + y_px
-    pixels = len(x)
-    t_ns = (edges_ns[:, None] + np.linspace(20_000, 120_000, pixels)).astype(np.int64) // 1000 * 1000
-    return EventBatch(
-        np.tile(x, len(edges_ns)).astype(np.uint16),
-        np.tile(y, len(edges_ns)).astype(np.uint16),
-        np.repeat(np.where(levels > 0, 1, -1), pixels).astype(np.int8),
-        t_ns.ravel(),
-        int(t_ns[-1, -1]),
-    )
+    return pixel_events(text, start_ns, BIT_RATE, columns[disc] + x_px, rows[disc] + y_px)
 
 
 def packets(events: EventBatch) -> list[bytes]:
