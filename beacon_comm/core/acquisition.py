@@ -58,7 +58,6 @@ OVERSAMPLED_SHARE = 0.9
 LEAST_CHANGES = 3.0
 """Words with fewer changes of level than this, in the mean, may be one character of a slower signal."""
 
-
 FEW_CHANGES = 2.0
 """One change of level within a word is what a glitch looks like, and a character of a faster signal between pauses."""
 

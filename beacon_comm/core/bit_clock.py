@@ -210,9 +210,8 @@ def see_edge(clock, to):  # type: ignore[no-untyped-def]
         return
     values = clock.values
     late = clock.latencies[to] / values[PERIOD]
-    begin = FINE + int(round((late - GATE) * FINE))
-    stop = FINE + int(round((late + GATE) * FINE))
-    begin, stop = max(begin, 0), min(stop, (EDGE_LAG + 2) * FINE)
+    begin = max(FINE + int(round((late - GATE) * FINE)), 0)
+    stop = min(FINE + int(round((late + GATE) * FINE)), (EDGE_LAG + 2) * FINE)
     up = 1 if to == ON else -1
     total, least, rise, events = 0, 0, 0, 0
     for k in range(begin, stop):

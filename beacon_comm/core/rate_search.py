@@ -209,9 +209,7 @@ class OctaveSearch(RateSearch):
         return 1.0 / _peaks(power[kept], frequency[kept], NAMED)
 
 
-def periods_around(
-    period: float, spread: float = NAMED_SPREAD, bits: float = 12 * LONG_WINDOW
-) -> NDArray[np.float64]:
+def periods_around(period: float, spread: float, bits: float) -> NDArray[np.float64]:
     """Return periods within a share of one, so close that the ends of so many bits move by :data:`PERIOD_STEP`."""
     steps = math.ceil(spread * bits / PERIOD_STEP)
     return period * (1.0 + spread * np.arange(-steps, steps + 1) / steps)

@@ -286,11 +286,12 @@ def _close_bit(clock, state, transitions, layout, gaps, rows, count):  # type: i
         likelihoods[:] = 0.0  # an erasure, or before the first event
     _step_free(state, likelihoods)
     decided = state.free_bits[np.argmax(state.free_metric)] >> EDGE_LAG
-    beside_gap = False
-    for back in range(EDGE_LAG + 2):
-        beside_gap |= state.silent[(numbers[BIT] - back) & _RING_MASK] == MISSING
-    if (decided ^ decided >> 1) & 1 and numbers[BIT] >= EDGE_LAG + MEMORY_BITS and not beside_gap:
-        see_edge(clock, decided & 1)
+    if (decided ^ decided >> 1) & 1 and numbers[BIT] >= EDGE_LAG + MEMORY_BITS:
+        beside_gap = False
+        for back in range(EDGE_LAG + 2):
+            beside_gap |= state.silent[(numbers[BIT] - back) & _RING_MASK] == MISSING
+        if not beside_gap:
+            see_edge(clock, decided & 1)
     _step_framed(state, transitions, likelihoods)
     numbers[BIT] += 1
     best = np.argmax(state.metric)
@@ -373,9 +374,9 @@ def _decide_word(clock, state, layout, length, best, at, lag, row):  # type: ign
     following = state.bits[best] << (MEMORY_BITS - 1) | (CONTEXTS // 2 - 1)
     after = following >> lag & (CONTEXTS // 2 - 1)
     likelihoods = np.zeros((length + MEMORY_BITS - 1, CONTEXTS))
-    erased = 0
+    erased, first = 0, at - length + 1
     for k in range(len(likelihoods)):
-        bit = at - length + 1 + k
+        bit = first + k
         if bit < numbers[BIT] and not _in_gap(state, bit):
             likelihoods[k] = state.likelihoods[bit & _RING_MASK]
         if k < length:
@@ -398,7 +399,6 @@ def _decide_word(clock, state, layout, length, best, at, lag, row):  # type: ign
         contexts[k] = context
         fit += likelihoods[k, context]
     fit /= length
-    first = at - length + 1
     if _events_share(state, contexts, first) < LEAST_EVENTS:
         row[WORD], row[KIND] = word, KIND_UNREADABLE
         return
@@ -418,7 +418,7 @@ def _decide_word(clock, state, layout, length, best, at, lag, row):  # type: ign
         row[KIND] = KIND_OK if margin >= OK_MARGIN else KIND_SEEN
     else:
         row[KIND] = KIND_UNREADABLE if erased and margin < READABLE_MARGIN else KIND_REPAIRED
-    row[BORDER_OF_START] = state.borders[(at - length + 1) & _RING_MASK]
+    row[BORDER_OF_START] = state.borders[first & _RING_MASK]
 
 
 @njit(cache=True, nogil=True)
