@@ -39,7 +39,7 @@ def run(clock, t, polarity, bits, sign=1, first=0, line=None, since=0):
     counts, borders = [], []
     for n in range(since, since + bits):
         borders.append(clock.values[BORDER])
-        first = take_events(clock, t, polarity, first, sign)
+        first = take_events(clock, t, polarity, first, sign, True)
         counts.append(clock.counts.copy())
         follow(clock, line, n)
         go_on(clock, 1)
@@ -110,7 +110,7 @@ def test_any_batching_gives_the_same_counts_and_the_same_clock(seed, cuts, sign)
     for start, stop in zip(edges[:-1], edges[1:], strict=True):
         first, batch = 0, (t[start:stop], polarity[start:stop])
         while True:
-            first = take_events(parted, *batch, first, sign)
+            first = take_events(parted, *batch, first, sign, True)
             if first == stop - start:
                 break
             follow(parted, line, len(counts))

@@ -330,7 +330,7 @@ def test_a_gap_says_nothing_wrong_and_is_read_on_after(gap_bits, search):
     assert times == sorted(times) and min(np.diff(times)) > 10_000_000
 
 
-@pytest.mark.parametrize('gap_bits', [2, 5, 10, 23, 60.5, 5000])
+@pytest.mark.parametrize('gap_bits', [2, 5, 10, 23, 60.5, 100.5, 350, 777, 5000])
 @pytest.mark.parametrize('begin_bits', [1003.3, 1007.0])
 def test_a_gap_it_is_told_of_costs_what_it_overlaps_and_two_more(gap_bits, begin_bits):
     sent = PROSE * 8
@@ -601,6 +601,42 @@ def test_real_recordings_are_read(data_folder, sonnet, name, bit_rate_bps, tail,
     assert np.mean([c.status is Status.OK for c in characters]) > 0.9
     told = np.median([c.bit_rate_bps for c in characters])
     assert told == pytest.approx(503.83 if bit_rate_bps == 504.0 else 3123.76, rel=5e-5)
+
+
+def test_a_beacon_of_few_events_is_confirmed(data_folder):
+    from beacon_comm.core.confirmation import ParityRecord
+    from beacon_comm.simulation.stress import thinned
+
+    t_ns, polarity = thinned(*real_events(data_folder, '504hz_30m.mat'), 0.05, 1)
+    assert len(t_ns) / (t_ns[-1] - t_ns[0]) * NS / 504 < 7  # events a bit
+    record = ParityRecord(Parameters())
+    for character in decode(demodulator(504.0, 3125.0), t_ns, polarity):
+        record.push(character)
+    assert record.confirmed
+
+
+@pytest.mark.parametrize('gap_bits', [100, 300, 600, 2000])
+def test_a_long_gap_in_the_real_recording_costs_two_characters_at_most(data_folder, gap_bits):
+    t_ns, polarity = real_events(data_folder, '3125hz_30m.mat')
+    bit_ns, end = NS / 3125, int(t_ns[-1]) + 1
+    whole = decode(demodulator(3125.0), t_ns, polarity, 0)
+    for begin in int(t_ns[0]) + np.arange(800_000_000, 2_400_000_000, 290_000_000):
+        stop = begin + round(gap_bits * bit_ns)
+        before, after = t_ns < begin, t_ns >= stop
+        receiver = demodulator(3125.0)
+        characters = receiver.push(t_ns[before], polarity[before], int(begin))
+        receiver.miss(int(begin), stop)
+        characters += decode(receiver, t_ns[after], polarity[after], 0, range(stop, end, 100_000_000))
+        times = np.array([c.t_ns for c in characters])
+        lost = 0
+        for sent in whole:
+            if begin - 11 * bit_ns < sent.t_ns < stop + bit_ns:
+                continue
+            found = characters[np.argmin(abs(times - sent.t_ns))]
+            if abs(found.t_ns - sent.t_ns) > 2.0 * bit_ns or found.code != sent.code:
+                lost += 1
+                assert abs(found.t_ns - sent.t_ns) > 2.0 * bit_ns or found.status is not Status.OK
+        assert lost <= 2
 
 
 @known('at 3125 bps the gap is not given out as a character')

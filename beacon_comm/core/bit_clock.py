@@ -133,13 +133,14 @@ def make_clock(
 
 
 @njit(cache=True, nogil=True)
-def take_events(clock, t, polarity, first, sign):  # type: ignore[no-untyped-def]
+def take_events(clock, t, polarity, first, sign, settled):  # type: ignore[no-untyped-def]
     """Count the events of the present bit.
 
     Args:
         clock: changed in place.
         t, polarity: events, ns (float64) and ±1 (int8), from ``first`` on.
         sign: -1 if ON and OFF change places, else 1.
+        settled: whether a fall may set an unsure phase: no gap is near, whose end would look like one.
 
     Returns:
         index of the first event behind the bit.
@@ -147,7 +148,7 @@ def take_events(clock, t, polarity, first, sign):  # type: ignore[no-untyped-def
     values, counts, signed = clock.values, clock.counts, clock.signed[-1]
     border, per_bin = values[BORDER], FINE / values[PERIOD]
     stop = border + values[PERIOD]
-    unsure = _unsure(clock)
+    unsure = settled and _unsure(clock)
     if not unsure:
         clock.run[0] = 0
     i = first
@@ -261,6 +262,7 @@ def _follow(values, latencies, to, residual):  # type: ignore[no-untyped-def]
 def go_on(clock, bits):  # type: ignore[no-untyped-def]
     """Go on by some bits: predict, and begin to count anew; ``clock`` is changed in place."""
     values = clock.values
+    agile = AGILE_NOISE * max(abs(values[BIAS]) - MOST_BIAS, 0.0) if clock.events[-1] else 0.0
     for row in range(EDGE_LAG + 1):
         clock.signed[row] = clock.signed[row + 1]
         clock.events[row] = clock.events[row + 1]
@@ -275,7 +277,6 @@ def go_on(clock, bits):  # type: ignore[no-untyped-def]
     values[SHIFT], values[STRETCH] = 0.0, 0.0
     values[P_PHASE] += bits * (2.0 * values[P_CROSS] + bits * values[P_PERIOD] + PHASE_NOISE * PHASE_NOISE)
     values[P_CROSS] += bits * values[P_PERIOD]
-    agile = AGILE_NOISE * max(abs(values[BIAS]) - MOST_BIAS, 0.0)
     values[P_PERIOD] += bits * (PERIOD_NOISE * PERIOD_NOISE + agile * agile)
     if values[P_PERIOD] > MOST_PERIOD_ERROR * MOST_PERIOD_ERROR:
         values[P_CROSS] *= MOST_PERIOD_ERROR / math.sqrt(values[P_PERIOD])

@@ -38,6 +38,7 @@ from beacon_comm.core.sequence_detection import (
     KIND_SEEN,
     KIND_UNREADABLE,
     LOST,
+    LOST_IN_GAP,
     MARGIN,
     PERIOD_THEN,
     STILL_LOCKED,
@@ -144,8 +145,8 @@ class SequenceDemodulator:
             if self._lock is not None:
                 status, found = self._follow(self._lock, t_end)
                 characters += found
-                if status == LOST:
-                    self._unlock()
+                if status in (LOST, LOST_IN_GAP):
+                    self._unlock(reread=status == LOST)
                 elif status != FULL:
                     break
             elif not self._attempt(t_end):
@@ -170,7 +171,7 @@ class SequenceDemodulator:
         before = self._follow(lock, self._known_to)[1]
         count = end_detection(lock.clock, lock.detection, self._transitions, self._layout, self._rows)
         characters = before + self._characters(self._rows[:count])
-        self._unlock()
+        self._unlock(reread=True)
         self._ended = lock
         return characters
 
@@ -218,10 +219,10 @@ class SequenceDemodulator:
         if better is not None and better.inverted == lock.inverted:
             self._begin(better, max(self._given_to - 2.0 * self._frame.length * period, float(self._t[first])))
 
-    def _unlock(self) -> None:
+    def _unlock(self, *, reread: bool) -> None:
         assert self._lock is not None
         lost_at = float(self._lock.clock.values[BORDER])
-        self._usable_from = max(self._given_to, lost_at - self._reread(self._lock))
+        self._usable_from = max(self._given_to, lost_at - self._reread(self._lock) if reread else lost_at)
         self._lock = None
         self._refine_at = math.inf
         self._taken = 0
@@ -372,7 +373,8 @@ class SequenceDemodulator:
             needed_from = max(self._given_to, t_end - self._reread(self._lock))
             if self._refine_at < math.inf:
                 needed_from = min(needed_from, self._refine_at - 2.0 * REFINED_AFTER * self._frame.length * self._lock.period)
-            first = min(self._taken, int(np.searchsorted(self._t, needed_from)))
+            too_much = len(self._t) - self._most_events
+            first = min(self._taken, max(int(np.searchsorted(self._t, needed_from)), too_much))
         else:
             needed_from = t_end - self._longest
             first = max(int(np.searchsorted(self._t, needed_from)), len(self._t) - self._most_events)

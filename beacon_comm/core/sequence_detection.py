@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from beacon_comm.core.bit_clock import BORDER, EDGE_LAG, PERIOD, go_on, see_edge, take_events
+from beacon_comm.core.bit_clock import BORDER, EDGE_LAG, P_PHASE, PERIOD, go_on, see_edge, take_events
 from beacon_comm.core.likelihood import CONTEXTS, COUNTS, LEVELS, MEMORY_BITS, SUB_SLOTS, learn, logarithms, weigh
 from beacon_comm.core.soft_decision import bit_ratios, margins
 from beacon_comm.core.trellis import NOISE_COST, UNLIKELY, framed_step, free_step
@@ -89,7 +89,10 @@ SLEEP_FRAMES = 6
 """After so many frames without any event nothing is left to decide, and the clock runs on alone."""
 
 UNKNOWN_PLACE_COST = 8.0
-"""Price of beginning at another place in the frame than the lock's (nat)."""
+"""Price of beginning at another place in the frame than the lock's, or the one that the clock says behind a gap (nat)."""
+
+MOST_UNSURE = 0.12
+"""Where the phase is less sure than this (bit) behind a gap, the lock is given up: a new one reads what came since."""
 
 RING = 64
 _RING_MASK = RING - 1
@@ -98,12 +101,12 @@ GAIN, SILENCE, USUAL, EMPTY = range(4)
 HEARD, SILENT, MISSING = range(3)
 
 # Whole numbers of the state.
-BIT, LEARNT, NEXT_TABLES, NOISE_RUN, DOUBT, SILENT_RUN, ASLEEP = range(7)
+BIT, LEARNT, NEXT_TABLES, NOISE_RUN, DOUBT, SILENT_RUN, ASLEEP, BEGUN = range(8)
 
 # What a row of words tells.
 WORD, KIND, BORDER_OF_START, MARGIN, PERIOD_THEN, FIRST_RATIO = range(6)
 KIND_OK, KIND_SEEN, KIND_REPAIRED, KIND_NOISE, KIND_UNREADABLE = range(5)
-STILL_LOCKED, LOST, FULL = range(3)
+STILL_LOCKED, LOST, LOST_IN_GAP, FULL = range(4)
 
 
 class Detection(NamedTuple):
@@ -120,7 +123,7 @@ class Detection(NamedTuple):
             best path to the state, and for each of them whether it ended a frame or was noise.
         likelihoods, counts, totals, rises, borders, silent: of the last ``RING`` bits; rises are the ON events, and silent is
             ``HEARD``, ``SILENT`` or ``MISSING``.
-        numbers: see the constants above, ``(7,)`` int64.
+        numbers: see the constants above, ``(8,)`` int64; a word's bits begin at ``BEGUN`` at the earliest.
     """
 
     histograms: NDArray[np.float64]
@@ -183,7 +186,7 @@ def make_detection(
         rises=np.zeros(RING),
         borders=np.zeros(RING),
         silent=np.zeros(RING, np.uint8),
-        numbers=np.array([0, learnt, learnt + 1, 0, 0, 0, 0], np.int64),
+        numbers=np.array([0, learnt, learnt + 1, 0, 0, 0, 0, MEMORY_BITS - 1], np.int64),
     )
 
 
@@ -213,7 +216,7 @@ def detect(  # type: ignore[no-untyped-def]
         rows: ``(n, FIRST_RATIO + length)`` float64, to be written.
 
     Returns:
-        number of rows, number of events taken, and STILL_LOCKED, LOST or FULL (call again with the rest).
+        number of rows, number of events taken, and STILL_LOCKED, LOST, LOST_IN_GAP or FULL (call again with the rest).
     """
     values, numbers, length = clock.values, state.numbers, transitions.length
     sign = -1 if inverted else 1
@@ -224,8 +227,10 @@ def detect(  # type: ignore[no-untyped-def]
         if numbers[ASLEEP]:
             if i == len(t):
                 return count, i, STILL_LOCKED
-            _wake(clock, state, transitions, t[i])
-        i = take_events(clock, t, polarity, i, sign)
+            if not _wake(clock, state, transitions, gaps, t[i]):
+                return count, i, LOST_IN_GAP
+        end = values[BORDER] + values[PERIOD]
+        i = take_events(clock, t, polarity, i, sign, not _missing(gaps, end - (EDGE_LAG + 2) * values[PERIOD], end))
         if i == len(t) and t_end < values[BORDER] + values[PERIOD]:
             return count, i, STILL_LOCKED
         count = _close_bit(clock, state, transitions, layout, gaps, rows, count)
@@ -237,24 +242,50 @@ def detect(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _wake(clock, state, transitions, t):  # type: ignore[no-untyped-def]
-    """Go on just before an event after a long silence."""
-    values = clock.values
-    skipped = np.floor((t - values[BORDER]) / values[PERIOD]) - 1.0
+def _missing(gaps, start, stop):  # type: ignore[no-untyped-def]
+    """Return whether events are missing between two times (ns)."""
+    missing = False
+    for k in range(len(gaps)):
+        missing |= gaps[k, 0] < stop and start < gaps[k, 1]
+    return missing
+
+
+@njit(cache=True, nogil=True)
+def _wake(clock, state, transitions, gaps, t):  # type: ignore[no-untyped-def]
+    """Go on just before an event after a long silence.
+
+    A silence is an idle line, which a start bit ends.  Where events were missing, the sender is taken to have gone on:
+    the first place in a frame is the one that is next by the clock.
+
+    Returns:
+        whether the clock still says where the bits begin.
+    """
+    values, numbers, length = clock.values, state.numbers, transitions.length
+    silent_since = values[BORDER] - numbers[SILENT_RUN] * values[PERIOD]
+    in_gap = _missing(gaps, silent_since, t)
+    skipped = max(np.floor((t - values[BORDER]) / values[PERIOD]) - 1.0, 0.0)
     if skipped > 0.0:
         go_on(clock, skipped)
     clock.frozen[0] = False
     clock.run[0] = 0
-    length = transitions.length
-    state.metric[:] = UNLIKELY
-    state.metric[length * 2 * CONTEXTS + CONTEXTS - 1] = 0.0
-    for context in range(CONTEXTS):
-        state.metric[(length + 1) * 2 * CONTEXTS + context] = -0.5 * NOISE_COST
+    if in_gap:
+        place = np.argmax(state.metric) // (2 * CONTEXTS)
+        state.metric[:] = -UNKNOWN_PLACE_COST
+        if place < length:
+            place = (place + int(skipped)) % length
+        state.metric[place * 2 * CONTEXTS : (place + 1) * 2 * CONTEXTS] = 0.0
+    else:
+        state.metric[:] = UNLIKELY
+        state.metric[length * 2 * CONTEXTS + CONTEXTS - 1] = 0.0
+        for context in range(CONTEXTS):
+            state.metric[(length + 1) * 2 * CONTEXTS + context] = -0.5 * NOISE_COST
     state.free_metric[:] = 0.0
     state.ends[:] = 0
     state.noises[:] = 0
-    state.numbers[SILENT_RUN] = 0
-    state.numbers[ASLEEP] = 0
+    numbers[SILENT_RUN] = 0
+    numbers[ASLEEP] = 0
+    numbers[BEGUN] = numbers[BIT]
+    return not (in_gap and values[P_PHASE] > MOST_UNSURE * MOST_UNSURE)
 
 
 @njit(cache=True, nogil=True)
@@ -278,9 +309,8 @@ def _close_bit(clock, state, transitions, layout, gaps, rows, count):  # type: i
     likelihoods = state.likelihoods[place]
     weigh(state.tables, counts, likelihoods)
     silent = SILENT if total < SILENT_SHARE * state.means.mean() * gain else HEARD
-    for k in range(len(gaps)):
-        if gaps[k, 0] < clock.values[BORDER] + clock.values[PERIOD] and clock.values[BORDER] < gaps[k, 1]:
-            silent = MISSING
+    if _missing(gaps, clock.values[BORDER], clock.values[BORDER] + clock.values[PERIOD]):
+        silent = MISSING
     state.silent[place] = silent
     if numbers[BIT] < MEMORY_BITS - 1 or silent == MISSING or (silent and silence < RARELY_SILENT):
         likelihoods[:] = 0.0  # an erasure, or before the first event
@@ -337,7 +367,7 @@ def _decide(clock, state, transitions, layout, best, lag, rows, count):  # type:
         return count
     if state.ends[best] >> lag & 1:
         numbers[NOISE_RUN] = 0
-        if at >= length + MEMORY_BITS - 2:
+        if at - length + 1 >= numbers[BEGUN]:
             _decide_word(clock, state, layout, length, best, at, lag, rows[count])
             count += 1
     elif state.noises[best] >> lag & 1:
