@@ -72,6 +72,20 @@ def test_a_candidate_is_judged_by_its_last_five_parities(last: list[Status], hap
     assert record.demoted == bool(happened)
 
 
+@pytest.mark.parametrize(('flipped', 'happened'), [((), {}), ((8,), {15: Verdict.REJECTED})])
+def test_a_repaired_parity_is_right_if_the_bits_say_so_without_the_frame(
+    flipped: tuple[int, ...], happened: dict[int, Verdict]
+) -> None:
+    record = ParityRecord(Parameters())
+    sent = list(characters(TEXT[:15], [REPAIRED] * 15))
+    for k, character in enumerate(sent):
+        bits = [character.frame >> shift & 1 for shift in range(FRAME.length - 1, -1, -1)]
+        sent[k] = replace(character, bit_llr=tuple(2.0 * (bit ^ (place in flipped)) - 1.0 for place, bit in enumerate(bits)))
+    assert sent[0].read_freely == (not flipped)
+    assert verdicts(record, sent) == happened
+    assert not record.confirmed
+
+
 def test_a_candidate_is_judged_again_every_fifteen() -> None:
     record = ParityRecord(Parameters())
     statuses = [PARITY] * 11 + [OK] * 4 + [PARITY] * 11 + [OK] * 4 + [PARITY] * 20

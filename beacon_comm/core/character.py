@@ -12,7 +12,7 @@ class Status(IntEnum):
     OK = 0
     """Start, parity and stop bits were right by evidence that could have failed."""
     REPAIRED = 1
-    """Only the frame structure rescued it; never given by the threshold receiver."""
+    """Only the frame structure rescued it, or other codes are too near; never given by the threshold receiver."""
     PARITY_ERROR = 2
     """The parity bit contradicts the data bits."""
     FRAMING_ERROR = 3
@@ -42,3 +42,11 @@ class Character:
     frame: int
     bit_rate_bps: float
     bit_llr: tuple[float, ...] = ()
+
+    @property
+    def read_freely(self) -> bool:
+        """Whether every bit of the frame is also what its events say without the frame's structure."""
+        length = len(self.bit_llr)
+        return length > 0 and all(
+            (ratio > 0.0) == bool(self.frame >> (length - 1 - place) & 1) for place, ratio in enumerate(self.bit_llr)
+        )

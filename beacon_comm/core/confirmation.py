@@ -74,8 +74,8 @@ class ParityRecord:
     demoted    never: a track that is tried again gets a new record                           --
     ========== ============================================================================== =========
 
-    With parity 'none' the status OK stands in for a right parity.  A REPAIRED character is neither ok nor right: the
-    structure that rescued it would have rescued noise as well.
+    With parity 'none' the status OK stands in for a right parity.  A REPAIRED character is not ok; its parity is right if
+    its bits say so without the frame: the structure that rescues a character would rescue noise as well.
 
     Attributes:
         characters, ok, repaired, parity_errors, framing_errors: counted characters since the slot was given.
@@ -154,7 +154,9 @@ class ParityRecord:
         self.parity_errors += status is Status.PARITY_ERROR
         self.framing_errors += status is Status.FRAMING_ERROR
         self._rights.append(
-            status is Status.OK or (status is Status.FRAMING_ERROR and self._layout.parity_bits > 0)
+            status is Status.OK
+            or (status is Status.FRAMING_ERROR and self._layout.parity_bits > 0)
+            or (status is Status.REPAIRED and character.read_freely)
         )
         vouches = status is Status.OK and not self._slipped(character)
         self._window.append(_Counted(character.code, character.frame, character.confidence, vouches))
