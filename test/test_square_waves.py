@@ -1,9 +1,11 @@
 """Lamps confirm nothing: square waves through the demodulator, the rate bank and the candidate slots.
 
-``docs/false_confirmation.py --full`` runs some 13 000 of them; here are those near rational multiples of a frame.
+``docs/false_confirmation.py --full`` runs some 13 000 of them, ``docs/false_alarms.py --full`` more through both receivers;
+here are those near rational multiples of a frame.
 """
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -25,6 +27,12 @@ DUTIES = (0.1, 0.3, 0.5, 0.6, 0.8, 0.9)
 SHARP = LedModel(Burst(8, 0.3, 20e-6, 30e-6, 1e-6, 0.0), Burst(8, 0.3, 20e-6, 30e-6, 1e-6, 0.0), 0.0)
 EDGES = LedModel(Burst(6, 0.0, 0.0, 1e-7, 1e-9, 0.0), Burst(6, 0.0, 0.0, 1e-7, 1e-9, 0.0), 0.0)
 BLURRED = LedModel(Burst(8, 0.5, 20e-6, 400e-6, 1e-6, 0.0), Burst(8, 0.5, 20e-6, 200e-6, 1e-6, 0.0), 200.0)
+
+
+def brighter(model: LedModel) -> LedModel:
+    """Return a model of five times the events: the sequence receiver calls little ok that has eight an edge."""
+    rise, fall = (replace(burst, events=5 * burst.events) for burst in (model.rise, model.fall))
+    return replace(model, rise=rise, fall=fall)
 
 
 def confirmations(characters: list[Character], parameters: Parameters) -> int:
@@ -56,6 +64,18 @@ def test_a_lamp_read_at_any_rate_is_not_confirmed(bit_rate_bps: float, model: Le
     assert total > 50  # characters were read, so the rules had something to refuse
 
 
+@pytest.mark.parametrize('rate_search', ['listed', 'blind'])
+@pytest.mark.parametrize('bit_rate_bps', [504.0, 3125.0])
+@pytest.mark.parametrize('model', [EDGES, SHARP, BLURRED], ids=['edges', 'sharp', 'blurred'])
+def test_the_sequence_receiver_confirms_no_lamp(rate_search: str, bit_rate_bps: float, model: LedModel) -> None:
+    parameters = Parameters(bit_rates=(bit_rate_bps,), rate_search=rate_search)
+    rational = [f for f in (bit_rate_bps / 11 / frames for frames in FRAMES[1::3]) if 50.0 <= f <= 1000.0]
+    for k, frequency_hz in enumerate([100.0, 120.0, *rational]):
+        duty = (0.3, 0.5, 0.8)[k % 3]
+        events = square_wave(frequency_hz, duty, 45 * 11 / bit_rate_bps, t0_ns=T0_NS, model=brighter(model))
+        assert confirmations(read(events, parameters), parameters) == 0, (frequency_hz, duty)
+
+
 @pytest.mark.parametrize(('frequency_hz', 'duty'), [(100.0, 0.5), (120.0, 0.5), (240.0, 0.3), (871.2, 0.6)])
 def test_a_lamp_is_not_confirmed_when_all_rates_are_tried(frequency_hz: float, duty: float) -> None:
     parameters = Parameters(bit_rates=(100.0, 504.0, 1000.0, 3125.0, 10_000.0), receiver='threshold')
@@ -63,11 +83,14 @@ def test_a_lamp_is_not_confirmed_when_all_rates_are_tried(frequency_hz: float, d
     assert confirmations(read(events, parameters), parameters) == 0
 
 
-@pytest.mark.parametrize('bit_rate_bps', [100.0, 504.0, 3125.0])
-def test_a_beacon_seen_through_the_same_model_is_confirmed(bit_rate_bps: float) -> None:
-    parameters = Parameters(bit_rates=(bit_rate_bps,), receiver='threshold')
-    text = "Shall I compare thee to a summer's day?\nThou art more lovely"
-    events = simulate_text(text, bit_rate_bps, t0_ns=T0_NS, model=SHARP)
+@pytest.mark.parametrize('receiver', ['threshold', 'sequence'])
+@pytest.mark.parametrize('bit_rate_bps', [504.0, 3125.0])
+@pytest.mark.parametrize('model', [EDGES, SHARP], ids=['edges', 'sharp'])
+def test_a_beacon_seen_through_the_same_model_is_confirmed(bit_rate_bps: float, model: LedModel, receiver: str) -> None:
+    parameters = Parameters(bit_rates=(bit_rate_bps,), receiver=receiver)
+    text = "Shall I compare thee to a summer's day?\nThou art more lovely " * 2
+    model = brighter(model) if receiver == 'sequence' else model
+    events = simulate_text(text, bit_rate_bps, t0_ns=T0_NS, model=model)
     assert confirmations(read(events, parameters), parameters) >= 1
 
 
