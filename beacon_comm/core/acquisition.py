@@ -30,6 +30,9 @@ from beacon_comm.core.trellis import Transitions, framed_path, free_bits, place_
 PHASES = 16
 """Phases of a bit at which the eye is measured."""
 
+EYE_STEPS = 64
+"""Periods are chosen by events that are sorted into so many steps of a bit."""
+
 EYE_SHARE = 0.95
 """The eye is open where it is within this share of its best."""
 
@@ -315,8 +318,9 @@ def _read(
 def _fine(t, polarity, start, period, stop):  # type: ignore[no-untyped-def]
     """Return the signed events of a window in ``PHASES`` bins a bit."""
     bins = np.zeros((int((stop - start) / period) + 2) * PHASES)
+    scale = PHASES / period
     for i in range(len(t)):
-        bins[int((t[i] - start) * PHASES / period)] += polarity[i]
+        bins[np.uint64((t[i] - start) * scale)] += polarity[i]
     return bins
 
 
@@ -327,18 +331,34 @@ def _eye(bins):  # type: ignore[no-untyped-def]
     total = np.zeros(len(bins) + 1)
     for i in range(len(bins)):
         total[i + 1] = total[i] + bins[i]
-    for phase in range(PHASES):
-        for first in range(phase, len(bins) - PHASES + 1, PHASES):
-            eye[phase] += abs(total[first + PHASES] - total[first])
+    for first in range(0, len(bins) - PHASES, PHASES):
+        early, late = total[first : first + PHASES], total[first + PHASES : first + 2 * PHASES]
+        for phase in range(PHASES):
+            eye[phase] += abs(late[phase] - early[phase])
+    eye[0] += abs(total[-1] - total[len(bins) - PHASES])
     return eye
 
 
 @njit(cache=True, nogil=True)
 def _eyes(t, polarity, start, periods, stop):  # type: ignore[no-untyped-def]
-    """Return the best eye at each period, ``(k,)``."""
-    best = np.empty(len(periods))
+    """Return the best eye at each period, ``(k,)``: from the sums of all signed events up to times that the periods share."""
+    step = periods.min() / EYE_STEPS
+    sums = np.zeros(int((stop - start) / step) + 2, np.int64)
+    scale = 1.0 / step
+    for i in range(len(t)):
+        sums[np.uint64((t[i] - start) * scale) + np.uint64(1)] += polarity[i]
+    for k in range(1, len(sums)):
+        sums[k] += sums[k - 1]
+    best = np.zeros(len(periods))
     for k in range(len(periods)):
-        best[k] = _eye(_fine(t, polarity, start, periods[k], stop)).max()
+        per_bit = periods[k] * scale
+        for phase in range(PHASES):
+            eye, early = 0, sums[np.uint64(phase * per_bit / PHASES)]
+            for n in range(1, int(len(sums) / per_bit - phase / PHASES)):
+                late = sums[np.uint64((n + phase / PHASES) * per_bit)]
+                eye += abs(late - early)
+                early = late
+            best[k] = max(best[k], eye)
     return best
 
 
