@@ -97,7 +97,6 @@ class Verdict(NamedTuple):
     Attributes:
         passing: words that the free bits confirm.
         failing: other words, and noise and idle bits that are none in units of words.
-        idle: bits of idle line.
         covered: bits of passing words.
         changes: of level in a passing word, mean.
         bits: bits of the window.
@@ -111,7 +110,6 @@ class Verdict(NamedTuple):
 
     passing: int
     failing: float
-    idle: int
     covered: int
     changes: float
     bits: int
@@ -280,7 +278,7 @@ def _read(
     if _judge(path, free, transitions.length)[0] < needed:
         return None
     histograms, likelihoods, path = _learn_framed(counts, path, transitions, inverted)
-    passing, failing, idle, changes = _judge(path, free, transitions.length)
+    passing, failing, changes = _judge(path, free, transitions.length)
     covered = passing * transitions.length
     framed = np.flatnonzero(path // (2 * CONTEXTS) < transitions.length)
     middle = int(framed[len(framed) // 2]) if len(framed) else 0
@@ -290,7 +288,6 @@ def _read(
     verdict = Verdict(
         passing,
         failing,
-        idle,
         covered,
         changes / max(passing, 1),
         bits,
@@ -585,15 +582,14 @@ def _may_convince(free, transitions):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _judge(path, free, length):  # type: ignore[no-untyped-def]
-    """Return passing words, failing ones, idle bits, and changes of level in passing words.
+    """Return passing words, failing ones, and changes of level in passing words.
 
     Noise, and idle line where the free bits are zeros, are failing in units of words.
     """
-    passing, failing, noise, idle, changes = 0, 0, 0, 0, 0
+    passing, failing, noise, changes = 0, 0, 0, 0
     for n in range(len(path)):
         position = path[n] // (2 * CONTEXTS)
         if position == length:
-            idle += 1
             noise += free[n] == 0
         elif position == length + 1:
             noise += 1
@@ -607,7 +603,7 @@ def _judge(path, free, length):  # type: ignore[no-untyped-def]
                     changes += free[n - k] != free[n - k - 1]
             else:
                 failing += 1
-    return passing, failing + noise / length, idle, changes
+    return passing, failing + noise / length, changes
 
 
 @njit(cache=True, nogil=True)
