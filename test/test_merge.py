@@ -192,10 +192,15 @@ def test_truth_reads_back(tmp_path: Path) -> None:
     truth = read_truth(tmp_path)
     assert (truth.width, truth.height, truth.start_s, truth.duration_s) == (WIDTH, HEIGHT, 0.25, 0.75)
     assert truth.stamp_start_ns == STAMP_START_NS
-    assert [b.disc for b in truth.beacons] == [b.disc for b in scene.beacons]
+    t_ns = np.arange(0, NS_PER_S, 1_000_000)
+    for read, put in zip(truth.beacons, scene.beacons, strict=True):
+        assert np.allclose(read.centre(t_ns), put.disc.centre(t_ns / NS_PER_S), atol=1e-6)
+        assert np.all(read.radius_px(t_ns) == put.disc.radius_px)
+        assert np.array_equal(read.visible(t_ns), (t_ns >= put.t_ns[0]) & (t_ns < put.end_ns))
+        assert read.bearing(t_ns) is None and not len(read.sendings_ns)
     assert truth.beacons[0].events == len(scene.beacons[0].t_ns)
-    (tmp_path / 'truth.json').write_text('{"schema": 2}')
-    with pytest.raises(RecordingError, match='schema 2'):
+    (tmp_path / 'truth.json').write_text('{"schema": 3}')
+    with pytest.raises(RecordingError, match='schema 3'):
         read_truth(tmp_path)
     (tmp_path / 'truth.json').write_text('[]')
     with pytest.raises(RecordingError, match='not the truth of a scene'):

@@ -80,8 +80,8 @@ def test_a_scene_is_written_with_its_truth(mat: Path, bag: Path, tmp_path: Path)
     assert main([*command, '--write', str(out), '--seed', '3', '--frame-id', 'front']) == 0
     truth = read_truth(out)
     assert [b.name for b in truth.beacons] == ['one.mat', 'one.mat']
-    assert truth.beacons[0].disc.vx_px_per_s == 50 and truth.beacons[0].end_s == 0.2
-    assert truth.beacons[1].end_s == truth.duration_s == pytest.approx(0.4, abs=1e-3)
+    assert truth.beacons[0].centre(100_000_000) == (25.0, 20.0) and truth.beacons[0].shown_ns[1] == 200_000_000
+    assert truth.beacons[1].shown_ns[1] / NS_PER_S == truth.duration_s == pytest.approx(0.4, abs=1e-3)
     stream = EventStream(PACKET_TYPE)
     events = [stream.push(cdr).batch for _, cdr in messages(out)]
     assert sum(len(batch) for batch in events if batch is not None) == sum(b.events for b in truth.beacons)
@@ -92,7 +92,7 @@ def test_a_scene_is_written_with_its_truth(mat: Path, bag: Path, tmp_path: Path)
     stream = EventStream(PACKET_TYPE)
     times = np.concatenate([batch.t_ns for _, cdr in messages(over) if (batch := stream.push(cdr).batch) is not None])
     assert np.all(np.diff(times) >= 0) and times[-1] > 0.99 * NS_PER_S
-    assert (read_truth(over).beacons[0].disc.x_px, read_truth(over).width) == (32, 64)
+    assert (read_truth(over).beacons[0].centre(0)[0], read_truth(over).width) == (32, 64)
 
 
 @pytest.mark.parametrize(

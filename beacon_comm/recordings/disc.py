@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beacon_comm.core.errors import ParameterError
+from beacon_comm.simulation.trajectory import Trajectory
 
 DEFAULT_RADIUS_PX = 4.0
 
@@ -82,6 +83,17 @@ class Disc:
         x = _folded(self.x_px + self.vx_px_per_s * t, self.radius_px, self.width - 1 - self.radius_px)
         y = _folded(self.y_px + self.vy_px_per_s * t, self.radius_px, self.height - 1 - self.radius_px)
         return x, y
+
+    def trajectory(self, until_s: float) -> Trajectory:
+        """Return the path from time 0 to ``until_s`` (s): the knots are the bounces."""
+        turns = [np.array([0.0, until_s])]
+        for at, speed, size in ((self.x_px, self.vx_px_per_s, self.width), (self.y_px, self.vy_px_per_s, self.height)):
+            span = size - 1 - 2 * self.radius_px
+            if speed and span:
+                to_wall = (size - 1 - self.radius_px - at if speed > 0 else at - self.radius_px) / abs(speed)
+                turns.append(np.arange(to_wall, until_s, span / abs(speed)))
+        t_ns = np.unique(np.rint(np.concatenate(turns) * 1e9).astype(np.int64))
+        return Trajectory(t_ns, *self.centre(t_ns * 1e-9))
 
     def pixels(self, t_ns: NDArray[np.int64], seed: int | list[int]) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
         """Return a pixel for each event at ``t_ns`` (ns since time 0, ``(n,)``): ``(x, y)``, each ``(n,)`` uint16.
