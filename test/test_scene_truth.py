@@ -29,6 +29,8 @@ BEACON = BeaconTruth(
     levels=np.array([0, 1], np.uint8),
     camera=CAMERA,
     events=7,
+    characters_ns=np.array([5 * MS]),
+    codes=np.array([72], np.uint8),
 )
 SCENE = SceneTruth(
     64, 48, 0.0, 0.05, 17, CAMERA, (BEACON,), (DistractorTruth('lamp', 'lamp', Trajectory.still(3.0, 4.0)),), PATH, 5
@@ -65,7 +67,7 @@ def test_a_file_keeps_all_of_it(tmp_path) -> None:
     (beacon,) = read.beacons
     for name in ('name', 'kind', 'width', 'height', 'shown_ns', 'text', 'bit_rate_bps', 'camera', 'events'):
         assert getattr(beacon, name) == getattr(BEACON, name)
-    for name in ('hidden_ns', 'sendings_ns', 'changes_ns', 'levels'):
+    for name in ('hidden_ns', 'sendings_ns', 'changes_ns', 'levels', 'characters_ns', 'codes'):
         assert np.array_equal(getattr(beacon, name), getattr(BEACON, name))
     times = np.arange(0, 50 * MS, MS // 3)
     assert np.array_equal(beacon.centre(times), BEACON.centre(times))

@@ -19,6 +19,7 @@ Schema 2, a simulated scene; its long arrays stand in ``truth.npz`` beside it, b
                                              key_radius_t_ns (m,), key_radius_px (m,)
                                              key_azimuth_rad, key_elevation_rad (k,): bearings at the knots, with a camera
                                              key_hidden_ns (n, 2), key_sendings_ns (s,), key_changes_ns (c,), key_levels (c,)
+                                             key_characters_ns (m,), key_codes (m,): each character's begin and code
      "distractors": [{"name", "kind", "key"}, …]     → key_t_ns, key_x_px, key_y_px
      "description": the scene as its file describes it}
 
@@ -161,7 +162,7 @@ def _path_arrays(arrays: Arrays, key: str, path: Trajectory) -> str:
 
 
 def _beacon_arrays(arrays: Arrays, key: str, beacon: BeaconTruth) -> str:
-    for name in ('hidden_ns', 'sendings_ns', 'changes_ns', 'levels'):
+    for name in ('hidden_ns', 'sendings_ns', 'changes_ns', 'levels', 'characters_ns', 'codes'):
         arrays[f'{key}_{name}'] = getattr(beacon, name)
     arrays[f'{key}_radius_t_ns'], arrays[f'{key}_radius_px'] = beacon.radii
     bearings = beacon.bearing(beacon.trajectory.t_ns)
@@ -254,9 +255,7 @@ def _simulated_scene(content: Mapping[str, Any], arrays: Arrays) -> SceneTruth:
     )
 
 
-def _simulated_beacon(
-    entry: Mapping[str, Any], arrays: Arrays, width: int, height: int, camera: Camera | None
-) -> BeaconTruth:
+def _simulated_beacon(entry: Mapping[str, Any], arrays: Arrays, width: int, height: int, camera: Camera | None) -> BeaconTruth:
     key = entry['key']
     begin_ns, end_ns = entry['shown_ns']
     return BeaconTruth(
@@ -275,6 +274,8 @@ def _simulated_beacon(
         arrays[f'{key}_levels'],
         camera,
         entry['events'],
+        arrays[f'{key}_characters_ns'],
+        arrays[f'{key}_codes'],
     )
 
 

@@ -88,6 +88,8 @@ class BeaconTruth:
         changes_ns, levels: when the line changes, ``(k,)`` int64, and to what, ``(k,)`` uint8; empty: unknown.
         camera: for bearings; None: none.
         events: how many the source has, where it was counted.
+        characters_ns, codes: begin of every character's start bit, ``(n,)`` int64, and what it is, ``(n,)`` uint8; empty:
+            unknown.  A sending that idle time cuts has only those that were sent.
     """
 
     name: str
@@ -105,6 +107,8 @@ class BeaconTruth:
     levels: Levels = field(default_factory=_no_levels)
     camera: Camera | None = None
     events: int | None = None
+    characters_ns: Times = field(default_factory=_no_times)
+    codes: Levels = field(default_factory=_no_levels)
 
     def centre(self, t_ns: ArrayLike) -> tuple[Floats, Floats]:
         """Return the true centre ``(x, y)`` (px) at event times (ns, any shape), float64 of that shape."""
