@@ -3,9 +3,6 @@
     beacon 0   ·· ··· ··  ·····           ┐
     beacon 1      ··· ·· ···· ····        ├─ by event time ─→ | 4 ms | 4 ms | 4 ms | …   seq 0, 1, 2 …
     background ························   ┘
-
-A packet is stamped with the time of its first event (its own begin, if it has none): stamp = ``stamp_start_ns`` +
-scene time.  It counts as recorded when its last event can have been: at its end.
 """
 
 from __future__ import annotations
@@ -17,10 +14,9 @@ import numpy as np
 
 from beacon_comm.core.errors import ParameterError
 from beacon_comm.core.events import NS_PER_S, EventBatch
+from beacon_comm.recordings.packets import PacketMaker
 from beacon_comm.recordings.sources import Background, Beacon
 from beacon_comm.recordings.storage import Message
-from beacon_comm.wire.cdr import build_event_packet
-from beacon_comm.wire.evt3_encoder import Evt3Encoder
 
 PACKET_PERIOD_S = 0.004
 STAMP_START_NS = 1_700_000_000 * NS_PER_S  # fixed, so that the same scene gives the same bytes
@@ -97,27 +93,16 @@ class Scene:
             start_s, duration_s: see :meth:`batches`.
             loop: for ever; the clock, the stamps and ``seq`` run on.
         """
-        encoder = Evt3Encoder(self.width, self.height)
+        maker = PacketMaker(self.width, self.height, self.stamp_start_ns, self.frame_id)
         shift_ns = 0
-        seq = 0
         while True:
             end_ns = begin_ns = self._span(start_s, duration_s)[0]
             for batch in self.batches(start_s, duration_s):
-                first_ns = int(batch.t_ns[0]) if len(batch) else end_ns
-                end_ns = batch.t_end_ns
-                shifted = EventBatch(batch.x, batch.y, batch.polarity, batch.t_ns + shift_ns, end_ns + shift_ns)
-                cdr = build_event_packet(
-                    stamp_ns=self.stamp_start_ns + shift_ns + first_ns,
-                    frame_id=self.frame_id,
-                    width=self.width,
-                    height=self.height,
-                    seq=seq,
-                    time_base_ns=0,
-                    encoding='evt3',
-                    payload=encoder.encode(shifted),
+                shifted = EventBatch(
+                    batch.x, batch.y, batch.polarity, batch.t_ns + shift_ns, batch.t_end_ns + shift_ns
                 )
-                yield self.stamp_start_ns + shifted.t_end_ns, cdr
-                seq += 1
+                yield maker.message(shifted, end_ns + shift_ns)
+                end_ns = batch.t_end_ns
             if not loop or end_ns == begin_ns:
                 return
             shift_ns += end_ns - begin_ns

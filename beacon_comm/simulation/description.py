@@ -40,6 +40,7 @@ from beacon_comm.simulation.keys import (
 from beacon_comm.simulation.paths import PATHS, PathKind, Shake, Still
 
 REFERENCE_M = 30.0
+PAPER_SLEW = 'the paper, section IV'
 DEFAULT_TEXT = 'The quick brown fox jumps over the lazy dog. '
 _SPANS = rows(2, '[begin_s, end_s]', spans=True)
 _DAY_S = 86_400.0
@@ -204,18 +205,14 @@ class Led:
     )
     size_mm: float = key(number, 'mm', 'its diameter: matters where it is wider than the point spread', 5.0, low=0, high=1e4)
     delay_us: float = key(number, 'µs', 'from a transition of the line to the driver', 0.0, low=0, high=1e5)
-    rise_us: float = key(number, 'µs', 'time constant of its rise', 100.0, low=0.1, high=1e6, source='the paper, section IV')
-    fall_us: float = key(number, 'µs', 'time constant of its fall', 60.0, low=0.1, high=1e6, source='the paper, section IV')
-    slow_share: float = key(
-        number,
-        '',
-        "share of the light that follows the power supply's slew instead",
-        0.0,
-        low=0,
-        high=1,
-        source='the paper, section IV',
+    rise_us: float = key(number, 'µs', 'time constant of its rise', 50.0, low=0.1, high=1e6, source=PAPER_SLEW)
+    fall_us: float = key(number, 'µs', 'time constant of its fall', 50.0, low=0.1, high=1e6, source=PAPER_SLEW)
+    rise_slew_us: float = key(
+        number, 'µs', 'before that, the driver rises by a constant rate: full swing', 1.0, low=0.1, high=1e6, source=PAPER_SLEW
     )
-    slow_us: float = key(number, 'µs', 'time constant of that share', 800.0, low=0.1, high=1e6, source='the paper, section IV')
+    fall_slew_us: float = key(
+        number, 'µs', 'and falls by a constant rate: full swing', 1.0, low=0.1, high=1e6, source=PAPER_SLEW
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """The lights of a scene as flat arrays, for the pixels' compiled loop: where, how strong, what shape, and what drives them.
 
-    drive     LEVELS   0 / 1 at given times, through the LED's and its driver's rise and fall      beacons, reflections
+    drive     LEVELS   0 / 1 at given times, through the driver's slew and the LED's rise and fall      beacons, reflections
               SINE     1 + depth · sin(2π f t + φ)                                                 lamps
               PULSES   on for a share of the period, with rise and fall                            PWM
               FLASHES  1 at each refresh, then exp(−t / fade)                                      a line of a screen
@@ -53,7 +53,7 @@ class Light:
         reach_px: beyond it there is nothing.
         half_px: half width and height of a rectangle; (0, 0): round.
         drive: LEVELS, SINE, PULSES or FLASHES.
-        numbers: the drive's six: LEVELS: delay, rise, fall, slow share, slow (ns, 1); SINE: f (1/ns), φ (turns), depth;
+        numbers: the drive's six: LEVELS: delay, rise, fall and both slews (ns); SINE: f (1/ns), φ (turns), depth;
             PULSES: f, φ, duty, edge (ns); FLASHES: f, φ, fade (ns).
         changes_ns, levels: of LEVELS.
     """
@@ -136,7 +136,7 @@ def beacon_light(beacon: BeaconKeys, line: Line, trajectory: Trajectory, descrip
         reach_px,
         (0.0, 0.0),
         LEVELS,
-        np.array([led.delay_us * 1e3, led.rise_us * 1e3, led.fall_us * 1e3, led.slow_share, led.slow_us * 1e3, 0.0]),
+        np.array([led.delay_us, led.rise_us, led.fall_us, led.rise_slew_us, led.fall_slew_us, 0.0]) * 1e3,
         line.changes_ns,
         line.levels,
     )

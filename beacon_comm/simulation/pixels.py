@@ -147,31 +147,35 @@ def _amplitudes(begin_ns, drive, numbers, changes_at, changes_ns, levels, cursor
 
 @njit(cache=True, nogil=True)
 def _led(begin_ns, numbers, first, stop, changes_ns, levels, cursor, state, s, out):  # type: ignore[no-untyped-def]
-    """Follow a line through the LED's and its driver's first-order rise and fall."""
-    delay, rise, fall, share, slow = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
+    """Follow a line through the driver's slew (constant rate) and the LED's rise and fall (first order)."""
+    delay, rise, fall, rise_slew, fall_slew = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
     k = cursor[s]
     level = 1.0 if k == first else float(levels[k - 1])
-    fast_y, slow_y = state[s, 0], state[s, 1]
-    full_rise, full_fall, full_slow = math.exp(-STEP_NS / rise), math.exp(-STEP_NS / fall), math.exp(-STEP_NS / slow)
+    current, light = state[s, 0], state[s, 1]
+    full_rise, full_fall = math.exp(-STEP_NS / rise), math.exp(-STEP_NS / fall)
     for step in range(BLOCK_STEPS):
         now = float(begin_ns + step * STEP_NS)
         end = now + STEP_NS
-        if k >= stop or changes_ns[k] + delay >= end:
-            fast_y = level + (fast_y - level) * (full_rise if level > 0.5 else full_fall)
-            slow_y = level + (slow_y - level) * full_slow
-        else:
-            while k < stop and changes_ns[k] + delay < end:
-                span = max(changes_ns[k] + delay - now, 0.0)
-                fast_y = level + (fast_y - level) * math.exp(-span / (rise if level > 0.5 else fall))
-                slow_y = level + (slow_y - level) * math.exp(-span / slow)
-                now += span
-                level = float(levels[k])
-                k += 1
-            fast_y = level + (fast_y - level) * math.exp(-(end - now) / (rise if level > 0.5 else fall))
-            slow_y = level + (slow_y - level) * math.exp(-(end - now) / slow)
-        out[step] = (1.0 - share) * fast_y + share * slow_y
+        while True:
+            turns = k < stop and changes_ns[k] + delay < end
+            until = max(changes_ns[k] + delay, now) if turns else end
+            span = until - now
+            before = current
+            current += min(max(level - current, -span / fall_slew), span / rise_slew)
+            if span == STEP_NS:
+                kept = full_rise if level > 0.5 else full_fall
+            else:
+                kept = math.exp(-span / (rise if level > 0.5 else fall))
+            middle = 0.5 * (before + current)
+            light = middle + (light - middle) * kept
+            now = until
+            if not turns:
+                break
+            level = float(levels[k])
+            k += 1
+        out[step] = light
     cursor[s] = k
-    state[s, 0], state[s, 1] = fast_y, slow_y
+    state[s, 0], state[s, 1] = current, light
 
 
 @njit(cache=True, nogil=True)
