@@ -73,10 +73,11 @@ class SimulatedScene:
             until_ns = min(begin_ns + piece_ns, end_ns)
             requests: list[RawEvents] = []
             for block_ns in range(begin_ns, until_ns, BLOCK_NS):
+                block_end_ns = min(block_ns + BLOCK_NS, end_ns)  # by blocks, so that the pieces' length changes nothing
                 requests.append(self._pixels.block(block_ns))
-            requests.append(self._noise.piece(begin_ns, until_ns))
-            if self._texture is not None:
-                requests.append(self._texture.piece(until_ns))
+                requests.append(self._noise.piece(block_ns, block_end_ns))
+                if self._texture is not None:
+                    requests.append(self._texture.piece(block_end_ns))
             if self._background is not None:
                 requests.append(self._background.piece(until_ns))
             yield self.readout.read(requests, until_ns)

@@ -28,7 +28,7 @@ from beacon_comm.simulation.trajectory import Floats, Trajectory
 
 STEP_PX = 0.4
 LAYERS = (0.8, 0.6)  # shares of the contrast: together its rms
-_SLOWEST_STEP_NS = 2_000_000
+_SLOWEST_STEP_NS = 1_000_000
 
 
 class MovingTexture:
