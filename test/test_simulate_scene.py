@@ -26,7 +26,10 @@ from beacon_comm.simulation.readout import Readout
 from beacon_comm.simulation.scene import SimulatedScene, simulate
 from beacon_comm.simulation.truth import SceneTruth
 
-QUIET = Sensor(width=64, height=64, noise_hz=0.0, hot_share=0.0, leak_hz=0.0, photon_noise=0.0)
+# All by hand, so that a new calibration changes no test.
+QUIET = Sensor(
+    64, 64, 0.22, 0.22, 0.05, 0.03, 60.0, 40.0, 90.0, 0.03, leak_hz=0.0, photon_noise=0.0, noise_hz=0.0, hot_share=0.0, psf_px=1.5
+)
 SQUARE = Led(rise_us=1.0, fall_us=1.0, rise_slew_us=1.0, fall_slew_us=1.0, contrast=20.0)
 MS = 1_000_000
 
@@ -96,7 +99,8 @@ def test_each_level_gives_its_polarity_within_a_refractory_time_or_two() -> None
 
 def test_an_edge_gives_as_many_events_as_its_log_step_holds_thresholds() -> None:
     """Without reset time, mismatch and noise: each pixel's ON events are ⌊ln(1 + contrast) / θ⌋."""
-    sensor = replace(QUIET, refractory_us=0.0, threshold_mismatch=0.0, threshold_noise=0.0, photoreceptor_us=0.0, follower_us=100.0)
+    even = replace(QUIET, threshold_mismatch=0.0, threshold_noise=0.0)
+    sensor = replace(even, refractory_us=0.0, photoreceptor_us=0.0, follower_us=100.0)
     slow = replace(SQUARE, rise_us=2000.0, fall_us=500.0)
     events, truth = run(scene(beacon(text='U', bit_rate_bps=(100.0,), led=slow, path=Still((31.0, 31.0))), sensor=sensor))
     rises = truth.beacons[0].changes_ns[truth.beacons[0].levels == 1]
@@ -115,7 +119,13 @@ def test_a_refractory_time_is_kept_by_every_pixel() -> None:
 
 
 @pytest.mark.parametrize(
-    'path', [Still((20.3, 40.8)), Line((20.0, 20.0), (300.0,), 30.0), Line((32.0, 32.0), (3000.0,), 70.0), Circle((31.0, 30.0), 15.0, (1000.0,))]
+    'path',
+    [
+        Still((20.3, 40.8)),
+        Line((20.0, 20.0), (300.0,), 30.0),
+        Line((32.0, 32.0), (3000.0,), 70.0),
+        Circle((31.0, 30.0), 15.0, (1000.0,)),
+    ],
 )
 def test_the_truth_is_where_the_events_are(path) -> None:
     events, truth = run(scene(beacon(path=path, bit_rate_bps=(1000.0,))))
@@ -220,7 +230,7 @@ def test_recorded_events_are_mixed_in() -> None:
     pieces = [recorded.slice(0, 100, int(t_ns[99])), recorded.slice(100, len(t_ns), 300 * MS)]
     events, _ = run(scene(beacon()), background=iter(pieces))
     mixed = events.t_ns[(events.x == 3) & (events.y == 4)]
-    assert np.array_equal(mixed, t_ns[t_ns < 200 * MS])
+    assert np.allclose(mixed, t_ns[t_ns < 200 * MS], rtol=0, atol=20_000)  # the bus may be busy
 
 
 @pytest.mark.parametrize(
