@@ -6,8 +6,8 @@
 
 What was sent when is known for the real recordings (the times of ``test_truth.py``), so that every event has a time since
 the last edge of the line.  Their clock has no zero: how much later the line is than those times is fitted, too
-(``SHIFT_US``).  The recordings hold the events of a region that never gives more than 49 in a burst: taken to be 7 × 7
-pixels.  From the simulation the same region around the beacon is taken.
+(``SHIFT_US``).  The recordings hold the events of a region that never gives more than 49 in a burst, in
+some nine rows: taken to be the 49 pixels within 4 px of its middle, and so from the simulation.
 
 The simulated scenes are the files ``outdoor_30m.yaml`` and ``outdoor_30m_3125.yaml`` of ``config/scenes``, with the
 sensor's defaults.
@@ -39,8 +39,8 @@ from beacon_comm.simulation.scene import simulate
 
 PROJECT = Path(__file__).resolve().parents[1]
 FIGURE = 'figures/simulator_calibration.png'
-REGION_PX = 3  # 7 × 7 pixels
-SIDE_PX = 40
+REGION_PX = 4.0  # 49 pixels
+SIDE_PX = 41
 BIN_US = 40.0
 LONGEST_US = 1600.0
 SEEDS = (1, 2, 3)
@@ -133,7 +133,7 @@ def simulated_signal(name: str, scene: SceneDescription, characters: int, seed: 
     events = list(batches)
     t_ns, x, y = (np.concatenate([getattr(batch, column) for batch in events]) for column in ('t_ns', 'x', 'y'))
     polarity = np.concatenate([batch.polarity for batch in events])
-    inside = (np.abs(x - middle - 0.5) <= REGION_PX) & (np.abs(y - middle - 0.5) <= REGION_PX)
+    inside = np.hypot(x - middle, y - middle) <= REGION_PX
     (sent,) = truth.beacons
     bit_ns = NS_PER_S / recorded.bit_rate_bps
     end_ns = int(sent.sendings_ns[0]) + round(characters * 11 * bit_ns)
@@ -321,7 +321,7 @@ def page(results: list[Compared], seeds: tuple[int, ...]) -> str:
         '',
         'Written by `python docs/calibrate_simulator.py --output docs/calibration.md`. What is simulated, and where it does',
         'not fit: [simulator.md](simulator.md#calibration). Real: the last sending of each recording; simulated: the same',
-        f'characters with the seeds {", ".join(map(str, seeds))}, the 7 × 7 pixels around the beacon.',
+        f'characters with the seeds {", ".join(map(str, seeds))}, the 49 pixels around the beacon.',
         '',
         f'![Real and simulated edges, bursts and counts]({FIGURE})',
         '',

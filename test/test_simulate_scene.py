@@ -28,7 +28,13 @@ from beacon_comm.simulation.truth import SceneTruth
 
 # All by hand, so that a new calibration changes no test.
 QUIET = Sensor(
-    64, 64, 0.22, 0.22, 0.05, 0.03, 60.0, 40.0, 90.0, 0.03, leak_hz=0.0, photon_noise=0.0, noise_hz=0.0, hot_share=0.0, psf_px=1.5
+    *(64, 64, 0.22, 0.22, 0.05, 0.03, 60.0, 40.0, 90.0, 0.03),
+    leak_hz=0.0,
+    photon_noise=0.0,
+    noise_hz=0.0,
+    hot_share=0.0,
+    psf_px=1.5,
+    scan_us=0.0,
 )
 SQUARE = Led(rise_us=1.0, fall_us=1.0, rise_slew_us=1.0, fall_slew_us=1.0, contrast=20.0)
 MS = 1_000_000
@@ -190,6 +196,14 @@ def test_a_bus_that_is_too_slow_delays_and_loses_events() -> None:
     assert fast.readout.lost == 0 and slow.readout.lost > 0.2 * counts[0]
     assert counts[1] <= 0.2 * 1e6  # a microsecond an event at least
     assert counts[0] - counts[1] == pytest.approx(slow.readout.lost, abs=1000)  # some still wait at the end
+
+
+def test_with_scans_a_pixel_fires_once_a_scan_and_the_spot_in_bursts() -> None:
+    sensor = replace(QUIET, refractory_us=5.0, refractory_mismatch=0.0, scan_us=100.0, scan_jitter=0.0, scan_row_us=1.0)
+    events, _ = run(scene(beacon(bit_rate_bps=(3125.0,)), sensor=sensor))
+    assert np.all((events.t_ns // 1000 - events.y) % 100 <= 20)  # its row's turn; the bus takes some time
+    pixel = (events.y.astype(int) * 64 + events.x) * 10_000_000 + events.t_ns // 100_000
+    assert len(np.unique(pixel)) > 0.98 * len(pixel) > 500
 
 
 def test_pixels_of_a_row_that_wait_share_a_stamp() -> None:

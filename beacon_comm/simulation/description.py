@@ -92,7 +92,7 @@ class Sensor:
         number,
         'µs',
         'how long a pixel is held in reset after an event',
-        60.0,
+        20.0,
         low=0,
         high=1e5,
         source='Lichtsteiner et al. 2008',
@@ -132,11 +132,22 @@ class Sensor:
     psf_px: float = key(
         number, 'px', 'standard deviation of the lens and sensor point spread', 1.7, low=0.2, high=20, source='Smith 2000'
     )
+    scan_us: float = key(
+        number,
+        'µs',
+        'how long the arbiter takes to come by all rows, at its own pace; 0: it is there at once',
+        98.0,
+        low=0,
+        high=1e5,
+        source='measured',
+    )
+    scan_jitter: float = key(number, '', 'standard deviation of that, as a share', 0.05, low=0, high=1, source='measured')
+    scan_row_us: float = key(number, 'µs', 'from a row to the next', 1.4, low=0, high=1e4, source='measured')
     row_us: float = key(
         number,
         'µs',
-        'time the arbiter needs for a row; its pending pixels share one time stamp',
-        1.0,
+        'time the bus needs for a row; its pending pixels share one time stamp',
+        0.1,
         low=0,
         high=100,
         source='Boahen 2000; Finateu et al. 2020',

@@ -9,8 +9,8 @@
                 │  θ differs from pixel to pixel (mismatch) and from event to event [Lichtsteiner 2008, Lin 2022]
                 │  the reference leaks downwards: ON events at leak_hz [Nozaki 2017]
                 ▼
-           event, then held in reset for refractory_us: what changes meanwhile is lost, and the reference is what y is
-           when the reset ends [Lichtsteiner 2008]
+           request; an event when the arbiter has come by (:mod:`~beacon_comm.simulation.scan`); then held in reset for
+           refractory_us: what changes meanwhile is lost, and the reference is what y is at its end [Lichtsteiner 2008]
 
 A pixel is simulated in steps of ``STEP_NS``, of several where its light hardly changes; a crossing's time is interpolated
 within the step.  Only pixels that a light reaches, and those still settling behind one that moved on, are simulated: for
@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from beacon_comm.simulation.description import SceneDescription, Sensor
 from beacon_comm.simulation.lights import FLASHES, LEVELS, PROFILE_STEPS, PULSES, SINE, FlatLights, Light
+from beacon_comm.simulation.scan import Scan, seen
 from beacon_comm.simulation.trajectory import Floats
 
 STEP_NS = 5_000
@@ -60,11 +61,17 @@ class LitPixels:
     """The pixels under the lights; keeps their state from block to block."""
 
     def __init__(
-        self, lights: list[Light], description: SceneDescription, mismatch: Mismatch, random: np.random.Generator
+        self,
+        lights: list[Light],
+        description: SceneDescription,
+        mismatch: Mismatch,
+        scan: Scan,
+        random: np.random.Generator,
     ) -> None:
         sensor = description.sensor
         self._lights = FlatLights.of(lights)
         self._mismatch = mismatch
+        self._scan = scan
         shape = sensor.height, sensor.width
         self._y1, self._y2, self._reference, self._free_ns = (np.zeros(shape) for _ in range(4))
         self._scale = np.ones(shape)
@@ -88,7 +95,10 @@ class LitPixels:
         self._none = not lights
 
     def block(self, begin_ns: int) -> RawEvents:
-        """Return the events of the block that begins at ``begin_ns``, not in order; blocks come one after the other."""
+        """Return the events of the block that begins at ``begin_ns``, not in order; blocks come one after the other.
+
+        The arbiter may see an event only after the block.
+        """
         if self._none:
             return np.empty(0, np.int64), np.empty(0, np.uint16), np.empty(0, np.uint16), np.empty(0, np.int8)
         lights = self._lights
@@ -101,7 +111,7 @@ class LitPixels:
             begin_ns, amplitude, strides, x_px, y_px, moves, lights.profile, lights.reach_px, lights.half_px,
             self._mismatch.threshold_on, self._mismatch.threshold_off, self._mismatch.refractory_ns,
             self._y1, self._y2, self._reference, self._free_ns, self._scale, self._awake, self._awake_list, self._slot,
-            self._physics, self._random,
+            self._physics, self._scan.begins_ns(begin_ns), self._scan.phase_ns, self._random,
         )
         return t_ns[:count], x[:count], y[:count], polarity[:count]
 
@@ -324,6 +334,8 @@ def _pixels(  # type: ignore[no-untyped-def]
     awake_list,
     slot,
     physics,
+    scans_ns,
+    phase_ns,
     random,
 ):
     """Run all pixels of a block; return their events, how many they are, and the pixels that stay awake."""
@@ -403,6 +415,8 @@ def _pixels(  # type: ignore[no-untyped-def]
             if y2 != before:
                 part = min(max((reference + crossed - before) / (y2 - before), 0.0), 1.0)
             event = end - span + part * span
+            if len(scans_ns):
+                event = seen(event, phase_ns[row], scans_ns)
             if count == capacity:
                 capacity *= 2
                 t_ns, event_x, event_y, polarity = (

@@ -1,9 +1,11 @@
 """A described scene as events and truth: everything that :func:`simulate` puts together.
 
-lights ──► LitPixels ──┐
-texture ─► MovingTexture ─┤
-SensorNoise ───────────┼─► Readout ─► EventBatch of piece_s
-a bag's events ────────┘
+Lights go through lens and pixels, everything through the readout::
+
+    lights ──► LitPixels, Scan ───┐
+    texture ─► MovingTexture ─────┤
+               SensorNoise ───────┼─► Readout ─► EventBatch of piece_s
+               a bag's events ────┘
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from beacon_comm.simulation.noise import SensorNoise
 from beacon_comm.simulation.paths import Still
 from beacon_comm.simulation.pixels import BLOCK_NS, LitPixels, Mismatch, RawEvents, threshold_radius
 from beacon_comm.simulation.readout import Readout
+from beacon_comm.simulation.scan import Scan
 from beacon_comm.simulation.texture import MovingTexture
 from beacon_comm.simulation.trajectory import Trajectory
 from beacon_comm.simulation.truth import NEVER_NS, BeaconTruth, Camera, DistractorTruth, SceneTruth
@@ -56,7 +59,8 @@ class SimulatedScene:
         shake = description.shake.trajectory(description.duration_s, seed)
         lights, self.truth = _lights_and_truth(description, shake, seed, streams[0])
         mismatch = Mismatch(sensor, streams[1])
-        self._pixels = LitPixels(lights, description, mismatch, streams[2])
+        self._scan = Scan(sensor, streams[5])
+        self._pixels = LitPixels(lights, description, mismatch, self._scan, streams[2])
         self._noise = SensorNoise(sensor, streams[3])
         texture = description.background.texture
         self._texture = None
@@ -75,9 +79,11 @@ class SimulatedScene:
             for block_ns in range(begin_ns, until_ns, BLOCK_NS):
                 block_end_ns = min(block_ns + BLOCK_NS, end_ns)  # by blocks, so that the pieces' length changes nothing
                 requests.append(self._pixels.block(block_ns))
-                requests.append(self._noise.piece(block_ns, block_end_ns))
+                others = [self._noise.piece(block_ns, block_end_ns)]
                 if self._texture is not None:
-                    requests.append(self._texture.piece(block_end_ns))
+                    others.append(self._texture.piece(block_end_ns))
+                for t_ns, x, y, polarity in others:
+                    requests.append((self._scan.seen_ns(t_ns, y, block_ns), x, y, polarity))
             if self._background is not None:
                 requests.append(self._background.piece(until_ns))
             yield self.readout.read(requests, until_ns)
