@@ -31,7 +31,7 @@ beacons:
     bit_rate_bps: 1000
     path: {kind: line, from_px: [30, 30], speed_px_per_s: 40, direction_deg: 30, margin_px: 20}
 distractors:
-  - {kind: lamp, path: {kind: still, at_px: [80, 65]}, radius_px: 2}
+  - {kind: lamp, path: {kind: still, at_px: [80, 12]}, radius_px: 2}
 """
 
 
@@ -73,9 +73,11 @@ def test_a_simulated_bag_is_read_by_the_receiver_and_its_truth_is_true(scene: Pa
     assert evaluate.main([*arguments, '--set', 'bit_rates=[1000.0]']) == 0
     confirmed = [one for one in json.loads(result.read_text())['beacons'] if one['state'] == 'confirmed']
     assert len(confirmed) == 1
-    read = {round((one['t_s'] * 1e9 - front.characters_ns[0]) / 11e6): one['code'] for one in confirmed[0]['characters']}
-    right = sum(read.get(k) == code for k, code in enumerate(front.codes))
-    assert right >= len(front.codes) - 3
+    read_ns = np.array([one['t_s'] * 1e9 for one in confirmed[0]['characters']])
+    codes = np.array([one['code'] for one in confirmed[0]['characters']])
+    nearest = np.abs(read_ns - front.characters_ns[:, None]).argmin(axis=1)
+    right = (codes[nearest] == front.codes) & (np.abs(read_ns[nearest] - front.characters_ns) < 2 * 1e6)
+    assert right.mean() > 0.95
 
 
 def test_the_same_seed_gives_the_same_bytes_in_every_format(scene: Path, tmp_path: Path) -> None:

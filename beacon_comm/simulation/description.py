@@ -53,10 +53,10 @@ class Sensor:
     width: int = key(whole, 'px', 'columns', 640, low=16, high=2048)
     height: int = key(whole, 'px', 'rows', 480, low=16, high=2048)
     threshold_on: float = key(
-        number, 'ln', 'step of log intensity that gives an ON event', 0.106, low=0.02, high=2, source='Lichtsteiner et al. 2008'
+        number, 'ln', 'step of log intensity that gives an ON event', 0.0955, low=0.02, high=2, source='Lichtsteiner et al. 2008'
     )
     threshold_off: float = key(
-        number, 'ln', 'the same for an OFF event', 0.143, low=0.02, high=2, source='Lichtsteiner et al. 2008'
+        number, 'ln', 'the same for an OFF event', 0.134, low=0.02, high=2, source='Lichtsteiner et al. 2008'
     )
     threshold_mismatch: float = key(
         number,
@@ -74,7 +74,7 @@ class Sensor:
         number,
         'µs',
         'time constant of the photoreceptor at brightness 1; inversely proportional to the light',
-        62.0,
+        67.3,
         low=0,
         high=1e5,
         source='Lichtsteiner et al. 2008; Hu et al. 2021',
@@ -83,7 +83,7 @@ class Sensor:
         number,
         'µs',
         'time constant of the stage behind it, whatever the light',
-        27.0,
+        30.2,
         low=1,
         high=1e4,
         source='Hu et al. 2021; Graça and Delbruck 2025',
@@ -92,7 +92,7 @@ class Sensor:
         number,
         'µs',
         'how long a pixel is held in reset after an event',
-        20.0,
+        17.9,
         low=0,
         high=1e5,
         source='Lichtsteiner et al. 2008',
@@ -113,7 +113,7 @@ class Sensor:
         number,
         'ln',
         'rms noise of log intensity at brightness 1; falls with the root of the light',
-        0.0155,
+        0.0157,
         low=0,
         high=0.5,
         source='Graça and Delbruck 2021; Hu et al. 2021',
@@ -130,7 +130,7 @@ class Sensor:
     hot_share: float = key(number, '', 'share of hot pixels', 1e-4, low=0, high=0.1, source='Hu et al. 2021')
     hot_hz: float = key(number, '1/s', 'events of a hot pixel', 200.0, low=0, high=1e5, source='Hu et al. 2021')
     psf_px: float = key(
-        number, 'px', 'standard deviation of the lens and sensor point spread', 1.7, low=0.2, high=20, source='Smith 2000'
+        number, 'px', 'standard deviation of the lens and sensor point spread', 1.86, low=0.2, high=20, source='Smith 2000'
     )
     scan_us: float = key(
         number,
@@ -141,7 +141,7 @@ class Sensor:
         high=1e5,
         source='measured',
     )
-    scan_jitter: float = key(number, '', 'standard deviation of that, as a share', 0.05, low=0, high=1, source='measured')
+    scan_jitter: float = key(number, '', 'standard deviation of that, as a share', 0.13, low=0, high=1, source='measured')
     scan_row_us: float = key(number, 'µs', 'from a row to the next', 1.4, low=0, high=1e4, source='measured')
     row_us: float = key(
         number,
@@ -212,17 +212,17 @@ class Led:
     """The LED and its driver; the defaults are those of the outdoor recordings (docs/simulator.md)."""
 
     contrast: float = key(
-        number, '', 'irradiance in the middle of its spot at 30 m, over the background of brightness 1', 9.8, low=0, high=1e6
+        number, '', 'irradiance in the middle of its spot at 30 m, over the background of brightness 1', 7.75, low=0, high=1e6
     )
     size_mm: float = key(number, 'mm', 'its diameter: matters where it is wider than the point spread', 5.0, low=0, high=1e4)
     delay_us: float = key(number, 'µs', 'from a transition of the line to the driver', 0.0, low=0, high=1e5)
-    rise_us: float = key(number, 'µs', 'time constant of its rise', 17.0, low=0.1, high=1e6, source=PAPER_SLEW)
+    rise_us: float = key(number, 'µs', 'time constant of its rise', 21.1, low=0.1, high=1e6, source=PAPER_SLEW)
     fall_us: float = key(number, 'µs', 'time constant of its fall', 17.0, low=0.1, high=1e6, source=PAPER_SLEW)
     rise_slew_us: float = key(
-        number, 'µs', 'before that, the driver rises steadily: its full swing', 1074.0, low=0.1, high=1e6, source=PAPER_SLEW
+        number, 'µs', 'before that, the driver rises steadily: its full swing', 1083.0, low=0.1, high=1e6, source=PAPER_SLEW
     )
     fall_slew_us: float = key(
-        number, 'µs', 'and falls steadily: its full swing', 296.0, low=0.1, high=1e6, source=PAPER_SLEW
+        number, 'µs', 'and falls steadily: its full swing', 279.0, low=0.1, high=1e6, source=PAPER_SLEW
     )
 
 
