@@ -61,8 +61,8 @@ class Recorded:
 
 
 RECORDINGS = {
-    '504hz_30m': Recorded(12.3804, 503.83, 504.0, 264, 'outdoor_30m', -55.7),
-    '3125hz_30m': Recorded(1.07076, 3123.74, 3125.0, 618, 'outdoor_30m_3125', -111.5),
+    '504hz_30m': Recorded(12.3804, 503.83, 504.0, 264, 'outdoor_30m', -51.4),
+    '3125hz_30m': Recorded(1.07076, 3123.74, 3125.0, 618, 'outdoor_30m_3125', -152.9),
 }
 
 
@@ -191,7 +191,7 @@ def misfit(real: Signal, simulated: Signal) -> float:
 
 
 def lone_counts(signal: Signal) -> dict[tuple[int, int], NDArray[np.int64]]:
-    """Return the events of its own polarity of each bit that stands alone, by (level, bits held before: 1, 2, 3 for more)."""
+    """Return the events of its own polarity of each lone bit, by (level, bits held before: 1, 2, 3 for more)."""
     before, now = held_bits(signal)
     part = slice(*np.searchsorted(signal.t_ns, (signal.changes_ns[0], signal.end_ns)))
     edge = np.searchsorted(signal.changes_ns, signal.t_ns[part], side='right') - 1
@@ -207,7 +207,7 @@ def lone_counts(signal: Signal) -> dict[tuple[int, int], NDArray[np.int64]]:
 
 
 def _lone_misfit(real: Signal, simulated: Signal) -> float:
-    """Return how far the counts of lone bits are apart: the Wasserstein distance of their distributions, in 15 events, squared."""
+    """Return how far the counts of lone bits are apart: their Wasserstein distance, in units of 15 events, squared."""
     theirs, ours = lone_counts(real), lone_counts(simulated)
     shares = np.linspace(0.02, 0.98, 49)
     total = sum(
@@ -472,7 +472,8 @@ def _draw_counts(axis: Any, one: Compared) -> None:
 # One sensor for all recordings; of each recording its LED, its line's shift, and how bright its background is: that of
 # REFERENCE is 1, by definition.
 SHARED = (
-    'threshold_on', 'threshold_off', 'photoreceptor_us', 'follower_us', 'refractory_us', 'photon_noise', 'psf_px', 'threshold_mismatch',
+    'threshold_on', 'threshold_off', 'photoreceptor_us', 'follower_us', 'refractory_us', 'photon_noise', 'psf_px',
+    'threshold_mismatch',
 )  # fmt: skip
 OF_LED = ('contrast', 'rise_us', 'fall_us', 'rise_slew_us', 'fall_slew_us')
 REFERENCE = '504hz_30m'

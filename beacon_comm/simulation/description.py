@@ -53,7 +53,7 @@ class Sensor:
     width: int = key(whole, 'px', 'columns', 640, low=16, high=2048)
     height: int = key(whole, 'px', 'rows', 480, low=16, high=2048)
     threshold_on: float = key(
-        number, 'ln', 'step of log intensity that gives an ON event', 0.0955, low=0.02, high=2, source='Lichtsteiner et al. 2008'
+        number, 'ln', 'step of log intensity for an ON event', 0.0955, low=0.02, high=2, source='Lichtsteiner et al. 2008'
     )
     threshold_off: float = key(
         number, 'ln', 'the same for an OFF event', 0.134, low=0.02, high=2, source='Lichtsteiner et al. 2008'
@@ -212,18 +212,16 @@ class Led:
     """The LED and its driver; the defaults are those of the outdoor recordings (docs/simulator.md)."""
 
     contrast: float = key(
-        number, '', 'irradiance in the middle of its spot at 30 m, over the background of brightness 1', 7.75, low=0, high=1e6
+        number, '', 'irradiance in the middle of its spot at 30 m, over the background of brightness 1', 7.527, low=0, high=1e6
     )
     size_mm: float = key(number, 'mm', 'its diameter: matters where it is wider than the point spread', 5.0, low=0, high=1e4)
     delay_us: float = key(number, 'µs', 'from a transition of the line to the driver', 0.0, low=0, high=1e5)
-    rise_us: float = key(number, 'µs', 'time constant of its rise', 21.1, low=0.1, high=1e6, source=PAPER_SLEW)
-    fall_us: float = key(number, 'µs', 'time constant of its fall', 17.0, low=0.1, high=1e6, source=PAPER_SLEW)
+    rise_us: float = key(number, 'µs', 'time constant of its rise', 20.79, low=0.1, high=1e6, source=PAPER_SLEW)
+    fall_us: float = key(number, 'µs', 'time constant of its fall', 17.92, low=0.1, high=1e6, source=PAPER_SLEW)
     rise_slew_us: float = key(
-        number, 'µs', 'before that, the driver rises steadily: its full swing', 1083.0, low=0.1, high=1e6, source=PAPER_SLEW
+        number, 'µs', 'before that, the driver rises steadily: its full swing', 1058.0, low=0.1, high=1e6, source=PAPER_SLEW
     )
-    fall_slew_us: float = key(
-        number, 'µs', 'and falls steadily: its full swing', 279.0, low=0.1, high=1e6, source=PAPER_SLEW
-    )
+    fall_slew_us: float = key(number, 'µs', 'and falls steadily: its full swing', 278.6, low=0.1, high=1e6, source=PAPER_SLEW)
 
 
 @dataclass(frozen=True, slots=True)

@@ -98,8 +98,9 @@ def _reach(peak: float, radius_px: float, psf_px: float) -> float:
     return radius_px + psf_px * math.sqrt(2.0 * max(math.log(max(peak, 1e-9) / NEGLIGIBLE), 0.5))
 
 
-def strength_of(beacon: BeaconKeys, brightness: float, duration_s: float) -> tuple[Times, Floats]:
+def strength_of(beacon: BeaconKeys, description: SceneDescription) -> tuple[Times, Floats]:
     """Return a beacon's strength over time: inverse square of the distance, over the background, cut by occluders."""
+    duration_s, brightness = description.duration_s, description.background.brightness
     knots = np.linspace(0.0, duration_s, 33 if len(beacon.distance_m) == 2 else 1)
     spans = [tuple(span) for span in beacon.occluded_s]
     if beacon.shown_s is not None:
@@ -124,7 +125,7 @@ def beacon_light(beacon: BeaconKeys, line: Line, trajectory: Trajectory, descrip
     focal_px = camera.focal_px[0] if camera is not None else DEFAULT_FOCAL_PX
     nearest_m = min(beacon.distance_m)
     radius_px = 0.5e-3 * beacon.led.size_mm / nearest_m * focal_px
-    strength = strength_of(beacon, description.background.brightness, description.duration_s)
+    strength = strength_of(beacon, description)
     reach_px = _reach(float(strength[1].max()), radius_px, psf_px)
     led = beacon.led
     return Light(

@@ -103,15 +103,44 @@ class LitPixels:
             return np.empty(0, np.int64), np.empty(0, np.uint16), np.empty(0, np.uint16), np.empty(0, np.int8)
         lights = self._lights
         amplitude, strides = _amplitudes(
-            begin_ns, lights.drive, lights.numbers, lights.changes_at, lights.changes_ns, lights.levels, self._cursor,
-            self._drive_state, lights.strength_at, lights.strength_ns, lights.strength,
+            begin_ns,
+            lights.drive,
+            lights.numbers,
+            lights.changes_at,
+            lights.changes_ns,
+            lights.levels,
+            self._cursor,
+            self._drive_state,
+            lights.strength_at,
+            lights.strength_ns,
+            lights.strength,
         )
         x_px, y_px, moves = _positions(begin_ns, lights.path_at, lights.path_ns, lights.path_x, lights.path_y)
         t_ns, x, y, polarity, count, self._awake_list = _pixels(
-            begin_ns, amplitude, strides, x_px, y_px, moves, lights.profile, lights.reach_px, lights.half_px,
-            self._mismatch.threshold_on, self._mismatch.threshold_off, self._mismatch.refractory_ns,
-            self._y1, self._y2, self._reference, self._free_ns, self._scale, self._awake, self._awake_list, self._slot,
-            self._physics, self._scan.begins_ns(begin_ns), self._scan.phase_ns, self._random,
+            begin_ns,
+            amplitude,
+            strides,
+            x_px,
+            y_px,
+            moves,
+            lights.profile,
+            lights.reach_px,
+            lights.half_px,
+            self._mismatch.threshold_on,
+            self._mismatch.threshold_off,
+            self._mismatch.refractory_ns,
+            self._y1,
+            self._y2,
+            self._reference,
+            self._free_ns,
+            self._scale,
+            self._awake,
+            self._awake_list,
+            self._slot,
+            self._physics,
+            self._scan.begins_ns(begin_ns),
+            self._scan.phase_ns,
+            self._random,
         )
         return t_ns[:count], x[:count], y[:count], polarity[:count]
 
@@ -420,7 +449,10 @@ def _pixels(  # type: ignore[no-untyped-def]
             if count == capacity:
                 capacity *= 2
                 t_ns, event_x, event_y, polarity = (
-                    longer(t_ns, capacity), longer(event_x, capacity), longer(event_y, capacity), longer(polarity, capacity)
+                    longer(t_ns, capacity),
+                    longer(event_x, capacity),
+                    longer(event_y, capacity),
+                    longer(polarity, capacity),
                 )
             t_ns[count] = int(event)
             event_x[count] = column

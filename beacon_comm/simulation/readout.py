@@ -39,7 +39,13 @@ class Readout:
         t_ns, x, y, polarity = t_ns[order], x[order], y[order], polarity[order]
         sensor = self._sensor
         served, stamps, place, self._free_ns, waiting, lost = _serve(
-            t_ns, y, sensor.height, float(end_ns), self._free_ns, sensor.row_us * 1e3, sensor.pixel_us * 1e3,
+            t_ns,
+            y,
+            sensor.height,
+            float(end_ns),
+            self._free_ns,
+            sensor.row_us * 1e3,
+            sensor.pixel_us * 1e3,
             sensor.longest_wait_us * 1e3,
         )
         self.lost += lost

@@ -18,7 +18,7 @@ import numpy as np
 from beacon_comm.core.errors import ParameterError
 from beacon_comm.core.events import NS_PER_S, EventBatch
 from beacon_comm.simulation.description import BeaconKeys, CameraKeys, Reflection, SceneDescription, Sensor
-from beacon_comm.simulation.lights import Light, beacon_light, lamp_lights, reflection_light
+from beacon_comm.simulation.lights import Light, beacon_light, lamp_lights, reflection_light, strength_of
 from beacon_comm.simulation.line import Line, line_of
 from beacon_comm.simulation.noise import SensorNoise
 from beacon_comm.simulation.paths import Still
@@ -133,7 +133,7 @@ def _lights_and_truth(
             raise ParameterError(f'beacons[{index}].path.{error}') from error
         light = beacon_light(keys, line, trajectory, description)
         by_name[keys.name] = light
-        beacons.append(_beacon_truth(keys, line, light, sensor, camera))
+        beacons.append(_beacon_truth(keys, line, light, description, camera))
     lights = list(by_name.values())
     distractors = []
     for index, one in enumerate(description.distractors):
@@ -152,8 +152,16 @@ def _lights_and_truth(
         lights += parts
         distractors.append(DistractorTruth(parts[0].name, parts[0].kind, trajectory))
     truth = SceneTruth(
-        sensor.width, sensor.height, 0.0, description.duration_s, STAMP_START_NS, camera, tuple(beacons), tuple(distractors),
-        shake, seed,
+        sensor.width,
+        sensor.height,
+        0.0,
+        description.duration_s,
+        STAMP_START_NS,
+        camera,
+        tuple(beacons),
+        tuple(distractors),
+        shake,
+        seed,
     )
     return lights, truth
 
@@ -163,17 +171,20 @@ def _camera(keys: CameraKeys, sensor: Sensor) -> Camera:
     return Camera(sensor.width, sensor.height, keys.focal_px[0], keys.focal_px[-1], cx, cy, d=keys.distortion)
 
 
-def _beacon_truth(keys: BeaconKeys, line: Line, light: Light, sensor: Sensor, camera: Camera | None) -> BeaconTruth:
+def _beacon_truth(
+    keys: BeaconKeys, line: Line, light: Light, description: SceneDescription, camera: Camera | None
+) -> BeaconTruth:
     # As if nothing hid it: the spot's size, not what is seen of it.
-    free = replace(light, strength=(light.strength[0], np.maximum(light.strength[1], _steady(light.strength[1]))))
+    strength = strength_of(replace(keys, occluded_s=(), shown_s=None), description)
+    radius_px = threshold_radius(replace(light, strength=strength), description.sensor)
     shown = (-NEVER_NS, NEVER_NS) if keys.shown_s is None else tuple(round(one * NS_PER_S) for one in keys.shown_s)
     return BeaconTruth(
         keys.name,
         'simulated',
         light.trajectory,
-        (light.strength[0], threshold_radius(free, sensor)),
-        sensor.width,
-        sensor.height,
+        (strength[0], radius_px),
+        description.sensor.width,
+        description.sensor.height,
         (shown[0], shown[1]),
         np.rint(np.array(keys.occluded_s, np.float64).reshape(-1, 2) * NS_PER_S).astype(np.int64),
         keys.text,
@@ -185,10 +196,6 @@ def _beacon_truth(keys: BeaconKeys, line: Line, light: Light, sensor: Sensor, ca
         characters_ns=line.characters_ns,
         codes=line.codes,
     )
-
-
-def _steady(strength: np.ndarray) -> float:
-    return float(strength.max()) if len(strength) < 33 else 0.0
 
 
 class _Recorded:

@@ -66,9 +66,16 @@ class MovingTexture:
         while self._now_ns < end_ns:
             step_ns = min(self._step_ns(), end_ns - self._now_ns)
             part = _step(
-                self._image(self._now_ns + step_ns), float(self._now_ns), float(step_ns), self._tau_ns,
-                self._mismatch.threshold_on, self._mismatch.threshold_off, self._mismatch.refractory_ns,
-                self._level, self._reference, self._last_ns,
+                self._image(self._now_ns + step_ns),
+                float(self._now_ns),
+                float(step_ns),
+                self._tau_ns,
+                self._mismatch.threshold_on,
+                self._mismatch.threshold_off,
+                self._mismatch.refractory_ns,
+                self._level,
+                self._reference,
+                self._last_ns,
             )
             parts.append(part)
             self._now_ns += step_ns
@@ -152,7 +159,10 @@ def _step(image, begin_ns, span_ns, tau_ns, threshold_on, threshold_off, refract
         if count + 64 * width > capacity:
             capacity = 2 * capacity + 64 * width
             t_ns, event_x, event_y, polarity = (
-                longer(t_ns, capacity), longer(event_x, capacity), longer(event_y, capacity), longer(polarity, capacity)
+                longer(t_ns, capacity),
+                longer(event_x, capacity),
+                longer(event_y, capacity),
+                longer(polarity, capacity),
             )
         for x in range(width):
             before = level[y, x]
