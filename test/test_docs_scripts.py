@@ -108,3 +108,16 @@ def test_a_simulated_recording_is_measured_against_itself() -> None:
     compared = calibrate.Compared(name, signals[0], signals[1:], few, many)
     assert '| 3125hz_30m | sequence | 0 of 40: 1.0000' in calibrate.page([compared], (2,))
     assert '| -10.0 |' in calibrate.page([compared], (2,))
+
+
+@pytest.mark.parametrize(('name', 'characters', 'most'), [('504hz_30m', 30, 9.0), ('3125hz_30m', 120, 6.0)])
+def test_the_simulated_scenes_are_near_the_recordings(name: str, characters: int, most: float, data_folder: Path) -> None:
+    """The margins themselves are held by ``calibrate_simulator.py --check``, which takes a minute."""
+    real = calibrate.real_signal(name)
+    simulated = calibrate.simulated_signal(name, calibrate.described(name), characters, 9)
+    theirs, ours = calibrate.numbers(real), calibrate.numbers(simulated)
+    assert ours.a_bit == pytest.approx(theirs.a_bit, rel=0.1)
+    assert ours.on_to_off == pytest.approx(theirs.on_to_off, rel=0.15)
+    assert ours.burst_us == pytest.approx(theirs.burst_us, rel=0.1)
+    assert ours.fall[0] == pytest.approx(theirs.fall[0], rel=0.15)
+    assert calibrate.misfit(real, simulated) < most
