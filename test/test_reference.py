@@ -41,9 +41,9 @@ def busy_scene(seed: int, rate_per_s: float) -> EventBatch:
 @pytest.mark.parametrize(
     ('seed', 'rate_per_s', 'parameters'),
     [
-        (1, 50_000, Parameters(receiver='threshold', lost_after_s=0.05)),
-        (2, 600_000, Parameters(receiver='threshold', bit_rates=(200.0, 3125.0), closing_px=4, max_area_px=400)),
-        (3, 1_500_000, Parameters(receiver='sequence', bit_rates=(3125.0,), max_tracks=40)),
+        (1, 50_000, Parameters(tracker='nearest', receiver='threshold', lost_after_s=0.05)),
+        (2, 600_000, Parameters(tracker='nearest', receiver='threshold', bit_rates=(200.0, 3125.0), closing_px=4, max_area_px=400)),
+        (3, 1_500_000, Parameters(tracker='nearest', receiver='sequence', bit_rates=(3125.0,), max_tracks=40)),
     ],
 )
 def test_from_bytes_to_characters_both_do_the_same(seed: int, rate_per_s: float, parameters: Parameters) -> None:

@@ -21,8 +21,10 @@ from numpy.typing import NDArray
 from beacon_comm.core.blobs import Blob, BlobFinder
 from beacon_comm.core.event_buffer import EventBuffer, buffer_length_ns
 from beacon_comm.core.events import EventBatch
+from beacon_comm.core.following import FollowingRouter
 from beacon_comm.core.hop_events import CODE_BITS, ON, ROUTED
 from beacon_comm.core.index_image import IndexImages, hop_length_ns
+from beacon_comm.core.motion_tracks import MotionTracker
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.routing import Routed, Router
 from beacon_comm.core.tracks import Track, TrackChanges, Tracker
@@ -67,7 +69,8 @@ class Detector:
         self._parameters = parameters
         self._hop_ns = hop_length_ns(parameters)
         self._buffer_ns = buffer_length_ns(parameters)
-        self._tracker = Tracker(parameters, sensor_size)
+        self._follows = parameters.tracker == 'motion'
+        self._tracker = MotionTracker(parameters, sensor_size) if self._follows else Tracker(parameters, sensor_size)
         self._buffers: dict[int, EventBuffer] = {}
         self._stats = DetectionStats()
         self._outside_before = self._overflow_before = 0
@@ -77,13 +80,15 @@ class Detector:
         self._sensor_size = sensor_size
         self._images = IndexImages(self._parameters, sensor_size)
         self._blobs = BlobFinder(self._parameters, sensor_size)
-        self._router = Router(self._parameters, sensor_size)
+        make_router = FollowingRouter if self._follows else Router
+        self._router: Router = make_router(self._parameters, sensor_size)
         self._t_hop_ns: int | None = None  # the last point of the hop grid
         self._early = TrackChanges()  # changes at hops that route() had to catch up with
 
     @property
     def tracks(self) -> Mapping[int, Track]:
-        """All tracks by label, oldest first."""
+        """All tracks by label, oldest first, as the events so far have them."""
+        self._router.settle()
         return self._tracker.tracks
 
     @property

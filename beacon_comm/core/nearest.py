@@ -31,12 +31,13 @@ def cell_lists(
     Returns:
         ``first``, ``(cells + 1,)`` int64, and ``member``, int32; see the module's head.
     """
-    first, member = _cell_lists(box, width, height, cells_along(width), cells_along(height))
+    first, member = list_cells(box, width, height, cells_along(width), cells_along(height))
     return first, member
 
 
 @njit(cache=True, nogil=True)
-def _cell_lists(box, width, height, across, down):  # type: ignore[no-untyped-def]
+def list_cells(box, width, height, across, down):  # type: ignore[no-untyped-def]
+    """Compile :func:`cell_lists`, with how many cells are side by side and one below the other."""
     m = len(box)
     span = np.zeros((m, 4), np.int64)
     first = np.zeros(across * down + 1, np.int64)

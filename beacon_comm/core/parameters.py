@@ -201,6 +201,11 @@ class Parameters(Declared):
     )
 
     # Tracks
+    tracker: str = parameter(
+        'motion',
+        "motion: tracks move on with their own events, filtered; nearest: blobs' nearest neighbours at hops, the paper's",
+        choices=('motion', 'nearest'),
+    )
     association_gate_px: float = parameter(12.0, 'largest distance of a blob from the predicted centre', 'px', 0.1)
     gate_growth_px_per_s: float = parameter(40.0, 'growth of the gate while a track is unseen', 'px/s', 0.0)
     max_gate_px: float = parameter(40.0, 'largest gate', 'px', 0.1)

@@ -91,14 +91,23 @@ class Router:
         n, start = len(segment), self._gathered
         if start + n > len(self._code):
             self._make_room(n)
-        self._gathered += n
         code = self._code[start : start + n]
         _pack(
             segment.x, segment.y, segment.polarity, segment.t_ns, self._grid.shift, self._t_hop_ns,
             code, self._offset_ns[start : start + n],
         )  # fmt: skip
-        _count_bands(code, self._in_band)
-        return self._own(segment, code) if self._track_ids else []
+        routed = self._own(segment, code) if self._track_ids else []
+        kept = self._keep(start, n)
+        _count_bands(code[:kept], self._in_band)
+        self._gathered += kept
+        return routed
+
+    def _keep(self, start: int, n: int) -> int:
+        """Return how many of the ``n`` events from ``start`` on are left for the windows."""
+        return n
+
+    def settle(self) -> None:
+        """Tell the tracks what the events since the last hop say about them."""
 
     def _on_sensor(self, segment: EventBatch) -> EventBatch:
         """Return the segment without the events beyond the sensor's borders."""
@@ -115,10 +124,7 @@ class Router:
     def _own(self, segment: EventBatch, code: NDArray[np.uint32]) -> list[Routed]:
         """Return each track's events, and flag them in ``code``."""
         count = np.zeros(len(self._track_ids) + 1, np.int64)
-        routed = _find_owners(
-            segment.x, segment.y, segment.t_ns, self._t_hop_ns, self._circle, self._first, self._member,
-            cells_along(self._grid.width), self._index, self._owner, code, count[1:],
-        )  # fmt: skip
+        routed = self._find_owners(segment, code, count[1:])
         if routed == 0:
             return []
         t_ns, polarity = np.empty(routed, np.int64), np.empty(routed, np.int8)
@@ -130,6 +136,15 @@ class Router:
             for track_id, start, stop in zip(self._track_ids, [0, *stops], stops, strict=False)
             if stop > start
         ]
+
+    def _find_owners(self, segment: EventBatch, code: NDArray[np.uint32], count: NDArray[np.int64]) -> int:
+        """List the events that are of a track, with their tracks; return how many."""
+        return int(
+            _find_owners(
+                segment.x, segment.y, segment.t_ns, self._t_hop_ns, self._circle, self._first, self._member,
+                cells_along(self._grid.width), self._index, self._owner, code, count,
+            )
+        )  # fmt: skip
 
     def close(self) -> HopEvents:
         """Return the events gathered in the hop interval, and begin the next one."""
@@ -179,13 +194,13 @@ def _find_owners(  # type: ignore[no-untyped-def]
     """
     near = np.uint64(0)  # unsigned, so that no place is taken to count from the end
     for i in range(len(x)):
-        cell = _cell(x[i], y[i], cells_across)
+        cell = cell_of(x[i], y[i], cells_across)
         index[near] = i
         near += np.uint64(first[cell] != first[cell + np.uint64(1)])
     routed = np.uint64(0)
     for j in range(near):
         e = np.uint64(index[j])
-        cell = _cell(x[e], y[e], cells_across)
+        cell = cell_of(x[e], y[e], cells_across)
         ex, ey, dt_ns = np.int64(x[e]), np.int64(y[e]), t_ns[e] - t_hop_ns
         nearest2 = np.inf
         best = np.int64(-1)
@@ -207,7 +222,8 @@ def _find_owners(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _cell(x, y, cells_across):  # type: ignore[no-untyped-def]
+def cell_of(x, y, cells_across):  # type: ignore[no-untyped-def]
+    """Return the cell of a pixel; see :mod:`.nearest`."""
     return np.uint64(y >> CELL_SHIFT) * np.uint64(cells_across) + np.uint64(x >> CELL_SHIFT)
 
 

@@ -62,6 +62,7 @@ class Track:
             none, or it has it now.
         covered_since_ns: since when (ns) an older track has had the blob it lies in, None: it lies in none.
         variance: of position (px²), of position and velocity (px²/s), of velocity (px²/s²), one axis.
+        noise: white acceleration (px²/s³) that the variance grows by.
     """
 
     track_id: int
@@ -80,11 +81,18 @@ class Track:
     tried_ns: int | None = None
     covered_since_ns: int | None = None
     variance: tuple[float, float, float] = field(default=(1.0, 0.0, _FIRST_SPEED_PX_PER_S**2))
+    noise: float = _ACCELERATION
 
     def position_at(self, t_ns: int) -> tuple[float, float]:
         """Return the predicted centre (px) at ``t_ns`` (ns)."""
         s = _fading_s((t_ns - self.t_ns) / NS_PER_S)
         return self.x_px + self.vx_px_per_s * s, self.y_px + self.vy_px_per_s * s
+
+    def variance_at(self, t_ns: int) -> float:
+        """Return the variance of the predicted centre (px²), one axis, at ``t_ns`` (ns)."""
+        dt = max(0, t_ns - self.t_ns) / NS_PER_S
+        pp, pv, vv = self.variance
+        return pp + dt * (2 * pv + dt * (vv + self.noise * dt / 3))
 
     def observe(self, x_px: float, y_px: float, t_ns: int, variance_px2: float) -> None:
         """Take an observation at ``t_ns``; one that is older than the state counts as of the state's time."""
@@ -109,12 +117,21 @@ class Track:
 
     def fall_quiet(self) -> None:
         """Go on by prediction; of the velocity only what is certain is kept, so that a still blob stays."""
-        speed2 = self.vx_px_per_s**2 + self.vy_px_per_s**2
-        known = speed2 > 0 and self.last_seen_ns - self.first_seen_ns >= _KNOWN_AFTER_NS
-        kept = max(0.0, 1.0 - 8.0 * self.variance[2] / speed2) if known else 0.0
+        kept = self.certain_share()
         self.vx_px_per_s *= kept
         self.vy_px_per_s *= kept
         self.quiet = True
+
+    def certain_share(self) -> float:
+        """Return which share of the velocity is certain."""
+        speed2 = self.vx_px_per_s**2 + self.vy_px_per_s**2
+        known = speed2 > 0 and self.last_seen_ns - self.first_seen_ns >= _KNOWN_AFTER_NS
+        return max(0.0, 1.0 - 8.0 * self.variance[2] / speed2) if known else 0.0
+
+    def stop(self, x_px: float, y_px: float, t_ns: int) -> None:
+        """Wait at a place from ``t_ns`` (ns) on."""
+        self.x_px, self.y_px, self.t_ns = x_px, y_px, t_ns
+        self.vx_px_per_s = self.vy_px_per_s = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +191,13 @@ class Tracker:
         lost = tuple(track for track in tracks if self._ended(track, t_hop_ns))
         for track in lost:
             del self._tracks[track.track_id]
-        left = self._unfollowed(tracks, blobs, blob_of, track_of, t_hop_ns)
+        left = self._unfollowed(tracks, blobs, track_of, t_hop_ns)
+        return self._begin(left, blobs, lost, t_hop_ns)
+
+    def _begin(
+        self, left: list[tuple[int, int]], blobs: Sequence[Blob], lost: tuple[Track, ...], t_hop_ns: int
+    ) -> TrackChanges:
+        """Begin tracks with the blobs that are left, as far as there is room."""
         evicted = self._make_room(left)
         room = max(0, self._parameters.max_tracks - len(self._tracks))
         new = tuple(self._new_track(blobs[j], t_hop_ns, tried_ns) for tried_ns, j in left[:room])
@@ -193,8 +216,19 @@ class Tracker:
     ) -> tuple[list[int], list[int]]:
         """Return each track's blob and each blob's track, -1 for none: globally nearest pairs first."""
         blob_of, track_of = [-1] * len(tracks), [-1] * len(blobs)
+        first, second, distance2 = self._gated(tracks, centre, blobs, t_hop_ns)
+        for k in np.lexsort((second, first, distance2)):
+            i, j = int(first[k]), int(second[k])
+            if blob_of[i] < 0 and track_of[j] < 0:
+                blob_of[i], track_of[j] = j, i
+        return blob_of, track_of
+
+    def _gated(
+        self, tracks: Sequence[Track], centre: NDArray[np.float64], blobs: Sequence[Blob], t_hop_ns: int
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+        """Return the pairs of track and blob within the track's gate, and their squared distances (px²), ``(n,)`` each."""
         if not tracks or not blobs:
-            return blob_of, track_of
+            return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
         p = self._parameters
         moving = np.array([(t.vx_px_per_s, t.vy_px_per_s, t.extent_px) for t in tracks])
         unseen_s = np.array([t_hop_ns - track.matched_ns for track in tracks]) / NS_PER_S
@@ -204,20 +238,14 @@ class Tracker:
         state = np.column_stack((centre, moving[:, :2], gate))
         seen = np.array([(blob.x_px, blob.y_px, (t_hop_ns - blob.t_ns) / NS_PER_S) for blob in blobs])
         first, second, distance2 = _pairs(state, seen)
-        for k in np.lexsort((second, first, distance2)):
-            i, j = int(first[k]), int(second[k])
-            if blob_of[i] < 0 and track_of[j] < 0:
-                blob_of[i], track_of[j] = j, i
-        return blob_of, track_of
+        return first, second, distance2
 
     def _keep_on_sensor(self, track: Track, t_hop_ns: int) -> None:
         """Let an unseen track wait at the border where it left: it cannot be seen beyond."""
         x, y = track.position_at(t_hop_ns)
         kept = min(max(x, 0.0), self._sensor_size[0] - 1.0), min(max(y, 0.0), self._sensor_size[1] - 1.0)
         if kept != (x, y):
-            track.x_px, track.y_px = kept
-            track.t_ns = t_hop_ns
-            track.vx_px_per_s = track.vy_px_per_s = 0.0
+            track.stop(*kept, t_hop_ns)
 
     def _ended(self, track: Track, t_hop_ns: int) -> bool:
         if track.quiet and t_hop_ns - track.last_seen_ns >= self._lost_after_ns:
@@ -227,16 +255,15 @@ class Tracker:
 
     def _unfollowed(
         self,
-        tracks: list[Track],
+        tracks: Sequence[Track],
         blobs: Sequence[Blob],
-        blob_of: list[int],
         track_of: list[int],
         t_hop_ns: int,
     ) -> list[tuple[int, int]]:
         """Return the blobs that are to begin tracks, the first one first, each behind the time (ns) of the turn that was had
         there, ``_NEVER`` without one; pieces of a followed blob are not among them."""
-        left = [j for j in range(len(blobs)) if track_of[j] < 0]
-        seen = [tracks[i] for i in range(len(tracks)) if blob_of[i] >= 0]
+        left = [j for j in range(len(blobs)) if track_of[j] < 0 and self._may_begin(blobs[j])]
+        seen = [track for track in tracks if not track.quiet]
         if left and seen:
             circle = np.column_stack((positions_at(seen, t_hop_ns), [track.extent_px for track in seen]))
             piece_of = _circle_of(np.array([(blobs[j].x_px, blobs[j].y_px) for j in left]), circle)
@@ -278,15 +305,22 @@ class Tracker:
                 self._tried_places.append((track.x_px, track.y_px, max(track.extent_px, 1.0), track.tried_ns))
         return tuple(ended)
 
+    def _may_begin(self, blob: Blob) -> bool:
+        """Return whether a track may begin with a blob."""
+        return True
+
     def _new_track(self, blob: Blob, t_hop_ns: int, tried_ns: int) -> Track:
-        variance = (blob.variance_px2 + _FLOOR_PX**2, 0.0, _FIRST_SPEED_PX_PER_S**2)
-        track = Track(
-            self._next_id, blob.x_px, blob.y_px, blob.t_ns, blob.extent_px, blob.index, blob.t_ns, blob.t_ns,
-            matched_ns=t_hop_ns, tried_ns=None if tried_ns == _NEVER else tried_ns, variance=variance,
-        )  # fmt: skip
+        track = self._make(self._next_id, blob, t_hop_ns, None if tried_ns == _NEVER else tried_ns)
         self._tracks[track.track_id] = track
         self._next_id += 1
         return track
+
+    def _make(self, track_id: int, blob: Blob, t_hop_ns: int, tried_ns: int | None) -> Track:
+        variance = (blob.variance_px2 + _FLOOR_PX**2, 0.0, _FIRST_SPEED_PX_PER_S**2)
+        return Track(
+            track_id, blob.x_px, blob.y_px, blob.t_ns, blob.extent_px, blob.index, blob.t_ns, blob.t_ns,
+            matched_ns=t_hop_ns, tried_ns=tried_ns, variance=variance,
+        )  # fmt: skip
 
 
 def positions_at(tracks: Sequence[Track], t_ns: int) -> NDArray[np.float64]:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from beacon_comm.core.blobs import AS_ACTIVE, Blob, BlobFinder
 from beacon_comm.core.components import AREA, SEEDS
 from beacon_comm.core.detection import Detector
+from beacon_comm.core.errors import ParameterError
 from beacon_comm.core.event_buffer import EventBuffer
 from beacon_comm.core.events import EventBatch
 from beacon_comm.core.hop_events import BAND_SHIFT, PixelGrid
@@ -93,6 +94,9 @@ class ReferenceRouter:
             for k, track_id in enumerate(self._track_ids)
             if (owner == k).any()
         ]
+
+    def settle(self) -> None:
+        """Tracks stay as they were at the last hop."""
 
     def close(self) -> ReferenceEvents:
         """Return the events gathered in the hop interval, and begin the next one."""
@@ -266,7 +270,16 @@ class ReferenceBlobFinder(BlobFinder):
 
 
 class ReferenceDetector(Detector):
-    """The detector with every stage in plain numpy."""
+    """The detector with every stage in plain numpy; for ``tracker: nearest`` only.
+
+    Raises:
+        ParameterError: another tracker.
+    """
+
+    def __init__(self, parameters: Parameters, sensor_size: tuple[int, int]) -> None:
+        if parameters.tracker != 'nearest':
+            raise ParameterError(f"tracker = {parameters.tracker!r}: the reference chain has 'nearest' only")
+        super().__init__(parameters, sensor_size)
 
     def _start(self, sensor_size: tuple[int, int]) -> None:
         super()._start(sensor_size)

@@ -1,0 +1,282 @@
+"""Following: every event to at most one track, and every few dozen events of a track tell where it is.
+
+    hop    |-- step --|-- step --|-- step --| …  1 ms each: circles along the predicted paths, cells they may touch
+    events   · ·· ····|· · ····· |·
+    update        ^      ^   ^               every 48 events of a track: residual to its path ─► motion filter ─► new path
+
+An event is of the nearest track whose circle holds it, both at the event's own time.  The circle grows by what is unknown:
+
+    radius = extent × routing_extent_factor + routing_margin_px + 3 σ + 2 |v| (time since the last update), bounded
+
+since something that turns back at a border is twice its speed away from where it was expected.
+
+Where two tracks are so near one another that the events of one may be nearer to the other, events tell only where the
+two are together: both take the mean residual of both, and their distance goes on as predicted, so that they pass
+through one another under their own labels instead of pushing one another off.
+
+The events of a track that moves by more than a share of its radius in a hop are hidden from the detection windows:
+there they would be a trail of it, in which false tracks begin.
+
+What is done depends on the events in their order alone: any batching gives the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from beacon_comm.core import motion
+from beacon_comm.core.events import NS_PER_S, EventBatch
+from beacon_comm.core.hop_events import ROUTED, HopEvents
+from beacon_comm.core.motion import (
+    EXTENT, HIDDEN, HOP_OFF, HOP_ON, HOP_RR, HOP_X, HOP_Y, LAST, N, SINCE, SUM_RR, SUM_T, SUM_X, SUM_Y, USUAL, VX, VY, T, X, Y,
+    fading_s, observe, variance_at,
+)  # fmt: skip
+from beacon_comm.core.motion_tracks import MotionTrack
+from beacon_comm.core.nearest import cells_along, list_cells
+from beacon_comm.core.parameters import Parameters
+from beacon_comm.core.routing import Router, cell_of
+from beacon_comm.core.tracks import Track
+
+STEPS = 10  # of a hop
+UPDATE_EVENTS = 48  # so many events of a track are an observation
+_FEWEST_EVENTS = 4  # at a hop's end so few are one
+_FEWEST_USUAL = 0.2  # less than this share of the usual rate says nothing about the position …
+_LEAST_SPAN_S = 1e-4  # … be it for so long or longer
+_GROWTH_PX = 12.0  # a circle grows by no more than this
+_SLACK_PX = 3.0  # a path may change by this within a step before the cells are listed again
+_LEAST_SPREAD_PX2 = 0.1  # variance of the events of a single pixel, and more
+_HIDDEN = np.uint32(0xFFFF_FFFF)  # code of an event that the windows do not get
+# Columns of a path: centre (px) at the step's begin, velocity (px/s), radius squared (px²), box that is listed, partner.
+_PX, _PY, _PVX, _PVY, _RR, _LEFT, _RIGHT, _TOP, _BOTTOM, _RADIUS = range(10)
+
+
+class FollowingRouter(Router):
+    """Routes the events of a hop interval and moves the tracks on with them."""
+
+    def __init__(self, parameters: Parameters, sensor_size: tuple[int, int]) -> None:
+        self._tracks: Sequence[MotionTrack] = ()
+        self._state = np.empty((0, motion.WIDTH))
+        self._step_ns = max(1, -(-round(parameters.hop_s * NS_PER_S) // STEPS))
+        self._hidden = False
+        super().__init__(parameters, sensor_size)
+
+    def aim(self, tracks: Sequence[Track], t_hop_ns: int) -> None:
+        """Route by ``tracks`` in the hop interval that begins at ``t_hop_ns`` (ns)."""
+        followed: list[MotionTrack] = [track for track in tracks if isinstance(track, MotionTrack)]
+        self._tracks = followed
+        self._track_ids = [track.track_id for track in tracks]
+        self._t_hop_ns = t_hop_ns
+        self._state = np.empty((len(followed), motion.WIDTH))
+        for k, track in enumerate(followed):
+            self._state[k] = track.aimed(t_hop_ns)
+            track.row = self._state[k]
+        self._path = np.zeros((len(followed), 10))
+        self._partner = np.full(len(followed), -1)
+        self._step = np.full(1, -1)
+        self._hidden = bool((self._state[:, HIDDEN] > 0).any())
+        self._first, self._member = np.empty(0, np.int64), np.empty(0, np.int32)
+
+    def _find_owners(self, segment: EventBatch, code: NDArray[np.uint32], count: NDArray[np.int64]) -> int:
+        width, height = self._grid.width, self._grid.height
+        routed, self._first, self._member = _follow(
+            segment.x, segment.y, segment.polarity, segment.t_ns, self._t_hop_ns, self._step_ns, self._step,
+            self._state, self._path, self._partner, self._first, self._member, width, height, self._factor, self._margin,
+            self._index, self._owner, code, count,
+        )  # fmt: skip
+        return int(routed)
+
+    def _keep(self, start: int, n: int) -> int:
+        if not self._hidden:
+            return n
+        stop = start + n
+        return int(_drop_hidden(self._code[start:stop], self._offset_ns[start:stop]))
+
+    def close(self) -> HopEvents:
+        """Return the events gathered in the hop interval, and begin the next one."""
+        _close(self._state, self._partner)
+        self.settle()
+        return super().close()
+
+    def settle(self) -> None:
+        """Tell the tracks what the events since the last hop say about them."""
+        for k in np.flatnonzero(self._state[:, HOP_ON] + self._state[:, HOP_OFF]):
+            self._tracks[k].settle()
+
+
+@njit(cache=True, nogil=True)
+def _follow(  # type: ignore[no-untyped-def]
+    x, y, polarity, t_ns, t_hop_ns, step_ns, step, state, path, partner, first, member, width, height, factor, margin,
+    index, owner, code, count,
+):  # fmt: skip
+    """List the events that are of a track, with their tracks; move the tracks on; return how many, and the cells' lists."""
+    across, down = cells_along_(width), cells_along_(height)
+    step_s = step_ns * 1e-9
+    routed = np.int64(0)
+    n = len(x)
+    i = 0
+    while i < n:
+        now = (t_ns[i] - t_hop_ns) // step_ns
+        if now != step[0]:
+            step[0] = now
+            for k in range(len(state)):
+                _lead(state[k], path[k], now * step_s, step_s, factor, margin)
+                _box(path[k], step_s)
+            _find_partners(path, state, partner)
+            first, member = list_cells(path[:, _LEFT : _BOTTOM + 1], width, height, across, down)
+        end_ns = t_hop_ns + (now + 1) * step_ns
+        begin_s = now * step_s
+        while i < n and t_ns[i] < end_ns:
+            cell = cell_of(x[i], y[i], across)
+            at, stop = first[cell], first[cell + np.uint64(1)]
+            if at == stop:
+                i += 1
+                continue
+            t_s = (t_ns[i] - t_hop_ns) * 1e-9
+            ex, ey, dt = np.float64(x[i]), np.float64(y[i]), t_s - begin_s
+            nearest2, best, best_x, best_y = np.inf, -1, 0.0, 0.0
+            for m in range(at, stop):
+                k = member[m]
+                dx = ex - (path[k, _PX] + path[k, _PVX] * dt)
+                dy = ey - (path[k, _PY] + path[k, _PVY] * dt)
+                d2 = dx * dx + dy * dy
+                if d2 <= path[k, _RR] and d2 < nearest2:
+                    nearest2, best, best_x, best_y = d2, k, dx, dy
+            if best >= 0:
+                code[i] |= np.uint32(ROUTED)
+                index[routed] = i
+                owner[routed] = best
+                count[best] += 1
+                routed += 1
+                row = state[best]
+                if row[HIDDEN] > 0:
+                    code[i] = _HIDDEN
+                if polarity[i] > 0:
+                    row[HOP_ON] += 1.0
+                else:
+                    row[HOP_OFF] += 1.0
+                row[HOP_X] += best_x
+                row[HOP_Y] += best_y
+                row[HOP_RR] += nearest2
+                row[LAST] = t_s
+                if row[N] == 0.0:
+                    row[SINCE] = t_s
+                row[N] += 1.0
+                row[SUM_X] += best_x
+                row[SUM_Y] += best_y
+                row[SUM_T] += t_s
+                row[SUM_RR] += nearest2
+                other = partner[best]
+                if row[N] + (state[other, N] if other >= 0 else 0.0) >= UPDATE_EVENTS:
+                    _update(state, best, other)
+                    _lead(row, path[best], begin_s, step_s, factor, margin)
+                    fits = _is_in_box(path[best], step_s)
+                    if other >= 0:
+                        _lead(state[other], path[other], begin_s, step_s, factor, margin)
+                        fits &= _is_in_box(path[other], step_s)
+                    if not fits:
+                        for k in range(len(state)):
+                            _box(path[k], step_s)
+                        first, member = list_cells(path[:, _LEFT : _BOTTOM + 1], width, height, across, down)
+            i += 1
+    return routed, first, member
+
+
+@njit(cache=True, nogil=True)
+def cells_along_(length_px):  # type: ignore[no-untyped-def]
+    return ((length_px - 1) >> 4) + 1
+
+
+@njit(cache=True, nogil=True)
+def _lead(row, path, begin_s, step_s, factor, margin):  # type: ignore[no-untyped-def]
+    """Lay a track's path through a step that begins at ``begin_s`` (s)."""
+    here, there = fading_s(begin_s - row[T]), fading_s(begin_s + step_s - row[T])
+    share = (there - here) / step_s
+    path[_PX], path[_PY] = row[X] + row[VX] * here, row[Y] + row[VY] * here
+    path[_PVX], path[_PVY] = row[VX] * share, row[VY] * share
+    unseen_s = max(0.0, begin_s + 0.5 * step_s - row[T])
+    growth = 3.0 * np.sqrt(max(0.0, variance_at(row, unseen_s))) + 2.0 * np.hypot(row[VX], row[VY]) * unseen_s
+    radius = row[EXTENT] * factor + margin + min(growth, _GROWTH_PX)
+    path[_RADIUS] = radius
+    path[_RR] = radius * radius
+
+
+@njit(cache=True, nogil=True)
+def _box(path, step_s):  # type: ignore[no-untyped-def]
+    radius = path[_RADIUS] + _SLACK_PX
+    dx, dy = path[_PVX] * step_s, path[_PVY] * step_s
+    path[_LEFT], path[_RIGHT] = path[_PX] + min(dx, 0.0) - radius, path[_PX] + max(dx, 0.0) + radius
+    path[_TOP], path[_BOTTOM] = path[_PY] + min(dy, 0.0) - radius, path[_PY] + max(dy, 0.0) + radius
+
+
+@njit(cache=True, nogil=True)
+def _is_in_box(path, step_s):  # type: ignore[no-untyped-def]
+    radius = path[_RADIUS]
+    dx, dy = path[_PVX] * step_s, path[_PVY] * step_s
+    return (
+        path[_PX] + min(dx, 0.0) - radius >= path[_LEFT]
+        and path[_PX] + max(dx, 0.0) + radius <= path[_RIGHT]
+        and path[_PY] + min(dy, 0.0) - radius >= path[_TOP]
+        and path[_PY] + max(dy, 0.0) + radius <= path[_BOTTOM]
+    )
+
+
+@njit(cache=True, nogil=True)
+def _find_partners(path, state, partner):  # type: ignore[no-untyped-def]
+    """Find for each track the nearest one whose events may be nearer to it, -1: none."""
+    m = len(path)
+    nearest2 = np.full(m, np.inf)
+    partner[:] = -1
+    for a in range(m):
+        for b in range(a + 1, m):
+            dx, dy = path[a, _PX] - path[b, _PX], path[a, _PY] - path[b, _PY]
+            reach = 2.0 * min(state[a, EXTENT], state[b, EXTENT]) + 1.0
+            d2 = dx * dx + dy * dy
+            if d2 < reach * reach:
+                if d2 < nearest2[a]:
+                    partner[a], nearest2[a] = b, d2
+                if d2 < nearest2[b]:
+                    partner[b], nearest2[b] = a, d2
+
+
+@njit(cache=True, nogil=True)
+def _update(state, k, other):  # type: ignore[no-untyped-def]
+    """Let a track take its sums as an observation, together with its partner, if it has one."""
+    row = state[k]
+    n, sx, sy, st, rr, since, usual = row[N], row[SUM_X], row[SUM_Y], row[SUM_T], row[SUM_RR], row[SINCE], row[USUAL]
+    row[N : SINCE + 1] = 0.0
+    if other >= 0:
+        o = state[other]
+        if o[N] > 0.0:
+            n, sx, sy, st, rr = n + o[N], sx + o[SUM_X], sy + o[SUM_Y], st + o[SUM_T], rr + o[SUM_RR]
+            since, usual = min(since, o[SINCE]), usual + o[USUAL]
+            o[N : SINCE + 1] = 0.0
+    if n < _FEWEST_USUAL * usual * max(row[LAST] - since, _LEAST_SPAN_S):
+        return  # a few of the background's, while it is dark
+    dx, dy = sx / n, sy / n
+    spread = max(0.5 * (rr / n - dx * dx - dy * dy), _LEAST_SPREAD_PX2)
+    observe(row, st / n, dx, dy, spread / n, 1.0 if other < 0 else 0.5)
+    if other >= 0:
+        observe(state[other], st / n, dx, dy, spread / n, 0.5)
+
+
+@njit(cache=True, nogil=True)
+def _close(state, partner):  # type: ignore[no-untyped-def]
+    """Take what is left of the hop's events."""
+    for k in range(len(state)):
+        if state[k, N] >= _FEWEST_EVENTS:
+            _update(state, k, partner[k])
+
+
+@njit(cache=True, nogil=True)
+def _drop_hidden(code, offset_ns):  # type: ignore[no-untyped-def]
+    """Close up the events that are not hidden; return how many."""
+    kept = 0
+    for i in range(len(code)):
+        if code[i] != _HIDDEN:
+            code[kept], offset_ns[kept] = code[i], offset_ns[i]
+            kept += 1
+    return kept

@@ -1,0 +1,185 @@
+"""How a track moves: three Kalman filters of constant velocity side by side, an interacting multiple model (IMM).
+
+    mode            white acceleration    for
+    0  steady            100 px²/s³       a still camera, uniform motion
+    1  turning         2·10⁶ px²/s³       a circle, a shaken camera
+    2  bounce         2·10¹⁰ px²/s³       a velocity that is another one within a millisecond
+
+Each update mixes the modes by their transition probabilities in the time since the last one, predicts and corrects every
+mode, and weighs them by how well each foresaw the observation (Blom and Bar-Shalom, 1988).  Both axes share one
+variance; an observation is the mean residual of a few dozen events to the predicted path, each at its own time, so that
+it lags behind nothing.  A prediction goes on at constant velocity for a moment and then fades:
+
+    distance(dt) = v s(dt),   s = dt for dt <= 0.1 s,   0.1 s + 1 s (1 - exp(-(dt - 0.1 s) / 1 s)) after
+
+A state is one row of float64, so that compiled loops work on the rows of all tracks:
+
+    row   [ T | modes 3 × (x y vx vy pp pv vv) | weights 3 | combined x y vx vy pp pv vv q | sums, see SUMS … | extent, … ]
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+STEADY_S = 0.1  # a prediction goes on unchanged for this long …
+FADE_S = 1.0  # … and then fades with this time constant
+
+MODES = 3
+ACCELERATION = np.array([100.0, 2e6, 2e10])  # white acceleration (px²/s³)
+LASTS_S = np.array([1e9, 0.2, 2e-3])  # a mode's acceleration goes on for so long
+# Rate of going over from a mode (row) to another (column) (1/s).
+RATE = np.array([[0.0, 2.0, 0.5], [5.0, 0.0, 2.0], [200.0, 400.0, 0.0]])
+FIRST_WEIGHT = np.array([0.6, 0.3, 0.1])
+
+# Columns of a row.
+T = 0  # time of the state since the hop (s)
+_MODE = 1  # x, y, vx, vy, pp, pv, vv of each mode
+_SIZE = 7
+_WEIGHT = _MODE + MODES * _SIZE
+X, Y, VX, VY, PP, PV, VV, NOISE = range(_WEIGHT + MODES, _WEIGHT + MODES + 8)
+# SUMS since the last update: events, residuals to the path (px), time (s), squared residual (px²), first event (s).
+N, SUM_X, SUM_Y, SUM_T, SUM_RR, SINCE = range(NOISE + 1, NOISE + 7)
+# SUMS of the hop: ON and OFF events, residuals, squared residual, and the time of the last event (s).
+HOP_ON, HOP_OFF, HOP_X, HOP_Y, HOP_RR, LAST = range(SINCE + 1, SINCE + 7)
+# ON and OFF events in windows that forget like the short and the long one.
+SHORT_ON, SHORT_OFF, LONG_ON, LONG_OFF = range(LAST + 1, LAST + 5)
+# Radius (px), whether the windows do not get its events, and how many events a second are usual.
+EXTENT, HIDDEN, USUAL = range(LONG_OFF + 1, LONG_OFF + 4)
+WIDTH = USUAL + 1
+
+
+@njit(cache=True, nogil=True)
+def fading_s(dt_s):  # type: ignore[no-untyped-def]
+    """Return s(dt), see the module's head."""
+    if dt_s <= STEADY_S:
+        return dt_s
+    return STEADY_S + FADE_S * (1.0 - math.exp((STEADY_S - dt_s) / FADE_S))
+
+
+@njit(cache=True, nogil=True)
+def begin(row, t_s, x, y, vx, vy, variance, speed_variance):  # type: ignore[no-untyped-def]
+    """Begin a state: time (s), centre (px), velocity (px/s), variances of an axis (px², px²/s²); the sums stay."""
+    row[T] = t_s
+    for j in range(MODES):
+        at = _MODE + j * _SIZE
+        row[at], row[at + 1], row[at + 2], row[at + 3] = x, y, vx, vy
+        row[at + 4], row[at + 5], row[at + 6] = variance, 0.0, speed_variance
+        row[_WEIGHT + j] = FIRST_WEIGHT[j]
+    row[N : SINCE + 1] = 0.0
+    _combine(row)
+
+
+@njit(cache=True, nogil=True)
+def brake(row, kept):  # type: ignore[no-untyped-def]
+    """Keep a share of the velocity."""
+    for j in range(MODES):
+        at = _MODE + j * _SIZE
+        row[at + 2] *= kept
+        row[at + 3] *= kept
+    _combine(row)
+
+
+@njit(cache=True, nogil=True)
+def rebase(row, later_s):  # type: ignore[no-untyped-def]
+    """Count times from a hop that is later (s)."""
+    row[T] -= later_s
+    row[LAST] -= later_s
+    row[SINCE] -= later_s
+    row[SUM_T] -= row[N] * later_s
+
+
+@njit(cache=True, nogil=True)
+def variance_at(row, dt_s):  # type: ignore[no-untyped-def]
+    """Return the variance of position (px²), one axis, ``dt_s`` after the state's time."""
+    return row[PP] + dt_s * (2.0 * row[PV] + dt_s * (row[VV] + row[NOISE] * dt_s / 3.0))
+
+
+@njit(cache=True, nogil=True)
+def observe(row, t_s, dx, dy, variance, share):  # type: ignore[no-untyped-def]
+    """Take an observation at ``t_s`` (s).
+
+    ``dx``, ``dy``: its residual to the combined path (px).  ``variance``: of an axis (px²).  ``share``: 1, or how much of
+    the state's own error is in the observation: 1/2 for the mean of two tracks.
+    """
+    dt = max(0.0, t_s - row[T])
+    s = fading_s(dt)
+    zx, zy = row[X] + row[VX] * s + dx, row[Y] + row[VY] * s + dy
+    old = row[_MODE:_WEIGHT].copy()
+    stay = np.empty(MODES)
+    for i in range(MODES):
+        out = 0.0
+        for j in range(MODES):
+            out += RATE[i, j]
+        stay[i] = math.exp(-out * dt)
+    weight, fit = np.empty(MODES), np.empty(MODES)
+    best = -np.inf
+    for j in range(MODES):
+        total = 0.0
+        part = np.empty(MODES)
+        for i in range(MODES):
+            out = 0.0
+            for k in range(MODES):
+                out += RATE[i, k]
+            p = stay[i] if i == j else (1.0 - stay[i]) * RATE[i, j] / out
+            part[i] = p * row[_WEIGHT + i]
+            total += part[i]
+        weight[j] = total
+        at = _MODE + j * _SIZE
+        x = y = vx = vy = 0.0
+        for i in range(MODES):
+            w, o = part[i] / total, i * _SIZE
+            x += w * old[o]
+            y += w * old[o + 1]
+            vx += w * old[o + 2]
+            vy += w * old[o + 3]
+        pp = pv = vv = 0.0
+        for i in range(MODES):
+            w, o = part[i] / total, i * _SIZE
+            ex, ey, evx, evy = old[o] - x, old[o + 1] - y, old[o + 2] - vx, old[o + 3] - vy
+            pp += w * (old[o + 4] + 0.5 * (ex * ex + ey * ey))
+            pv += w * (old[o + 5] + 0.5 * (ex * evx + ey * evy))
+            vv += w * (old[o + 6] + 0.5 * (evx * evx + evy * evy))
+        q = ACCELERATION[j] * min(1.0, LASTS_S[j] / dt) if dt > 0.0 else 0.0
+        x += vx * s
+        y += vy * s
+        pp += dt * (2.0 * pv + dt * (vv + q * dt / 3.0))
+        pv += dt * (vv + q * dt / 2.0)
+        vv += q * dt
+        expected = share * pp + variance
+        ex, ey = zx - x, zy - y
+        fit[j] = -0.5 * (ex * ex + ey * ey) / expected - math.log(expected)
+        best = max(best, fit[j])
+        kp, kv = share * pp / expected, share * pv / expected
+        row[at], row[at + 1] = x + kp * ex, y + kp * ey
+        row[at + 2], row[at + 3] = vx + kv * ex, vy + kv * ey
+        row[at + 4] = pp - kp * share * pp
+        row[at + 5] = pv - kp * share * pv
+        row[at + 6] = vv - kv * share * pv
+    total = 0.0
+    for j in range(MODES):
+        weight[j] = max(weight[j] * math.exp(fit[j] - best), 1e-12)
+        total += weight[j]
+    for j in range(MODES):
+        row[_WEIGHT + j] = weight[j] / total
+    row[T] += dt
+    _combine(row)
+
+
+@njit(cache=True, nogil=True)
+def _combine(row):  # type: ignore[no-untyped-def]
+    """Sum the modes up: mean, variance of an axis with the spread of the means, and white acceleration."""
+    row[X:WIDTH][: NOISE + 1 - X] = 0.0
+    for j in range(MODES):
+        w, at = row[_WEIGHT + j], _MODE + j * _SIZE
+        for k in range(4):
+            row[X + k] += w * row[at + k]
+        row[NOISE] += w * ACCELERATION[j]
+    for j in range(MODES):
+        w, at = row[_WEIGHT + j], _MODE + j * _SIZE
+        ex, ey, evx, evy = row[at] - row[X], row[at + 1] - row[Y], row[at + 2] - row[VX], row[at + 3] - row[VY]
+        row[PP] += w * (row[at + 4] + 0.5 * (ex * ex + ey * ey))
+        row[PV] += w * (row[at + 5] + 0.5 * (ex * evx + ey * evy))
+        row[VV] += w * (row[at + 6] + 0.5 * (evx * evx + evy * evy))

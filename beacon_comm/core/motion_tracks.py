@@ -1,0 +1,243 @@
+"""Tracks that move on with their own events, between hops (:mod:`.following`); blobs begin them and bring them back.
+
+    at a hop    own events, as many as usual       ──► seen, wherever the blobs are
+                a blob of its own                  ──► seen; where its own events were fewer: there it is
+                neither                            ──► quiet: predicted, and what comes within its circle moves it again
+                a fresh blob of no track           ──► a new track
+
+The paper's index of a track is that of a pixel moved along: its events over its area in windows that forget like the
+detection's short and long one, so that a fast one has an index, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beacon_comm.core import motion
+from beacon_comm.core.association import assign
+from beacon_comm.core.blobs import Blob
+from beacon_comm.core.events import NS_PER_S
+from beacon_comm.core.index_image import whole_hops
+from beacon_comm.core.motion import (
+    EXTENT, HIDDEN, HOP_OFF, HOP_ON, HOP_RR, HOP_X, HOP_Y, LAST, LONG_OFF, LONG_ON, NOISE, PP, PV, SHORT_OFF, SHORT_ON,
+    USUAL, VV, VX, VY, T, X, Y,
+)  # fmt: skip
+from beacon_comm.core.parameters import Parameters
+from beacon_comm.core.tracks import Track, TrackChanges, Tracker, positions_at
+
+_FEWEST_EVENTS = 4
+_SEEN_SHARE = 0.1  # of the usual events of a hop: fewer are the background's
+_SPREAD_EVENTS = 30  # fewer say nothing about the extent
+_EXTENT_RISE, _EXTENT_FALL, _EXTENT_MOVED = 0.5, 0.05, 0.2
+_LEAST_EXTENT_PX = 0.5
+_USUAL_GAIN = 0.1
+_HIDDEN_SHARE = 0.5  # of its radius a track moves in a hop before its events are hidden from the windows
+_HIDDEN_AFTER_HOPS = 2
+_FIRST_SPEED_PX_PER_S = 200.0
+_SURPRISE = 16.0  # a blob more than 4 standard deviations away: begin anew there
+_SAME_EXTENTS = 1.1  # two tracks of one blob are half a disc's centroids apart: 0.85 radii
+_KNOWN_AFTER_NS = 100_000_000
+
+
+@dataclass(slots=True)
+class MotionTrack(Track):
+    """A track with a motion filter.
+
+    Attributes:
+        row: its state, see :mod:`.motion`.
+        origin_ns: the hop that the row's times count from (ns).
+    """
+
+    row: NDArray[np.float64] = field(default_factory=lambda: np.zeros(motion.WIDTH))
+    origin_ns: int = 0
+
+    def aimed(self, t_hop_ns: int) -> NDArray[np.float64]:
+        """Return the row for the hop interval that begins at ``t_hop_ns`` (ns), with the hop's sums at zero."""
+        motion.rebase(self.row, (t_hop_ns - self.origin_ns) / NS_PER_S)
+        self.origin_ns = t_hop_ns
+        self.row[HOP_ON : HOP_RR + 1] = 0.0
+        self.row[EXTENT] = self.extent_px
+        return self.row
+
+    def settle(self) -> None:
+        """Take the row's state over."""
+        x, y, vx, vy, pp, pv, vv, noise = self.row[X : NOISE + 1].tolist()
+        self.x_px, self.y_px, self.vx_px_per_s, self.vy_px_per_s = x, y, vx, vy
+        self.t_ns = self.origin_ns + round(float(self.row[T]) * NS_PER_S)
+        self.variance, self.noise = (pp, pv, vv), noise
+
+    def begin(self, x_px: float, y_px: float, t_ns: int, variance_px2: float, speed_variance: float) -> None:
+        """Be at a place at ``t_ns`` (ns), at an unknown velocity."""
+        motion.begin(self.row, (t_ns - self.origin_ns) / NS_PER_S, x_px, y_px, 0.0, 0.0, variance_px2, speed_variance)
+        self.settle()
+
+    def observe(self, x_px: float, y_px: float, t_ns: int, variance_px2: float) -> None:
+        """Take an observation at ``t_ns``; one that is older than the state counts as of the state's time."""
+        t_ns = max(t_ns, self.t_ns)
+        x, y = self.position_at(t_ns)
+        if (x_px - x) ** 2 + (y_px - y) ** 2 > _SURPRISE * (self.variance_at(t_ns) + variance_px2):
+            speed2 = self.vx_px_per_s**2 + self.vy_px_per_s**2
+            self.begin(x_px, y_px, t_ns, variance_px2, _FIRST_SPEED_PX_PER_S**2 + speed2)
+            return
+        motion.observe(self.row, (t_ns - self.origin_ns) / NS_PER_S, x_px - x, y_px - y, variance_px2, 1.0)
+        self.settle()
+
+    def fall_quiet(self) -> None:
+        """Go on by prediction; of the velocity only what is certain is kept, so that a still blob stays."""
+        motion.brake(self.row, self.certain_share())
+        self.settle()
+        self.quiet = True
+
+    def stop(self, x_px: float, y_px: float, t_ns: int) -> None:
+        """Wait at a place from ``t_ns`` (ns) on."""
+        self.begin(x_px, y_px, t_ns, self.variance[0], self.variance[2])
+
+
+class MotionTracker(Tracker):
+    """Keeps tracks that move on with their own events."""
+
+    def __init__(self, parameters: Parameters, sensor_size: tuple[int, int]) -> None:
+        super().__init__(parameters, sensor_size)
+        short = whole_hops(parameters.short_window_s, parameters.hop_s)
+        long = whole_hops(parameters.long_window_bits * parameters.slowest_bit_s, parameters.hop_s)
+        self._forget = np.array([1.0 - 1.0 / short] * 2 + [1.0 - 1.0 / max(short, long)] * 2)
+        self._least_index = parameters.index_threshold * parameters.index_grow_share
+
+    def update(self, blobs: Sequence[Blob], t_hop_ns: int) -> TrackChanges:
+        """Associate the blobs of the hop that ends at ``t_hop_ns`` (ns)."""
+        if not blobs and not self._tracks:
+            return TrackChanges()
+        tracks: list[MotionTrack] = list(self._tracks.values())  # type: ignore[arg-type]
+        blob_of, track_of = self._matched(tracks, blobs, t_hop_ns)
+        rows = np.array([track.row for track in tracks]) if tracks else np.empty((0, motion.WIDTH))
+        own, index, spread = self._evidence(rows)
+        hop_s = self._parameters.hop_s
+        seen = (
+            (own >= np.maximum(_FEWEST_EVENTS, _SEEN_SHARE * rows[:, USUAL] * hop_s)) & (index >= self._least_index)
+        ).tolist()
+        for i, track in enumerate(tracks):
+            track.row[SHORT_ON : LONG_OFF + 1] = rows[i, SHORT_ON : LONG_OFF + 1]
+            if blob_of[i] >= 0 or seen[i]:
+                blob = blobs[blob_of[i]] if blob_of[i] >= 0 else None
+                self._see(track, blob, t_hop_ns, float(own[i]), float(index[i]), float(spread[i]), seen[i])
+            else:
+                if not track.quiet:
+                    track.fall_quiet()
+                self._keep_on_sensor(track, t_hop_ns)
+                track.row[HIDDEN] = 0.0
+        self._find_doubles(tracks, t_hop_ns)
+        lost = tuple(track for track in tracks if self._ended(track, t_hop_ns))
+        for track in lost:
+            del self._tracks[track.track_id]
+        left = self._unfollowed(tracks, blobs, track_of, t_hop_ns)
+        return self._begin(left, blobs, lost, t_hop_ns)
+
+    def _evidence(self, rows: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return each track's events of the hop, its index and the spread of the events as an extent (px)."""
+        own = rows[:, HOP_ON] + rows[:, HOP_OFF]
+        rows[:, SHORT_ON : LONG_OFF + 1] *= self._forget
+        for on, off in ((SHORT_ON, SHORT_OFF), (LONG_ON, LONG_OFF)):
+            rows[:, on] += rows[:, HOP_ON]
+            rows[:, off] += rows[:, HOP_OFF]
+        area = np.pi * np.maximum(rows[:, EXTENT], 1.0) ** 2
+        index = np.zeros(len(rows))
+        for on, off in ((SHORT_ON, SHORT_OFF), (LONG_ON, LONG_OFF)):
+            n, difference = rows[:, on] + rows[:, off], np.abs(rows[:, on] - rows[:, off])
+            index = np.maximum(index, n / (self._parameters.index_offset * area + difference))
+        n = np.maximum(own, 1.0)
+        mean2 = (rows[:, HOP_X] ** 2 + rows[:, HOP_Y] ** 2) / n**2
+        return own, index, np.sqrt(2.0 * np.maximum(rows[:, HOP_RR] / n - mean2, 0.0))
+
+    def _see(
+        self, track: MotionTrack, blob: Blob | None, t_hop_ns: int, own: float, index: float, spread: float, seen: bool
+    ) -> None:
+        """Let a track be seen, by its blob or by its own events."""
+        hop_s = self._parameters.hop_s
+        hop_ns = round(hop_s * NS_PER_S)
+        extent = track.extent_px
+        if blob is not None:
+            if blob.fresh and own < 0.5 * blob.fresh_count and track.row[HIDDEN] == 0.0:
+                track.observe(blob.x_px, blob.y_px, blob.t_ns, blob.variance_px2 + 0.05**2)
+                track.last_seen_ns = max(track.last_seen_ns, blob.t_ns)
+            track.index = blob.index
+            extent = blob.extent_px
+        else:
+            track.index = index
+        if seen:
+            track.last_seen_ns = track.origin_ns + round(float(track.row[LAST]) * NS_PER_S)
+            track.row[USUAL] += _USUAL_GAIN * (own / hop_s - track.row[USUAL])
+        gain = _EXTENT_RISE if extent > track.extent_px else _EXTENT_FALL
+        if seen and own >= _SPREAD_EVENTS and spread < extent:
+            extent = spread
+            gain = _EXTENT_RISE if extent > track.extent_px else _EXTENT_MOVED
+        track.extent_px = max(_LEAST_EXTENT_PX, track.extent_px + gain * (extent - track.extent_px))
+        track.quiet = False
+        track.matched_ns = t_hop_ns
+        speed = float(np.hypot(track.vx_px_per_s, track.vy_px_per_s))
+        old = t_hop_ns - track.first_seen_ns >= _HIDDEN_AFTER_HOPS * hop_ns
+        track.row[HIDDEN] = float(seen and old and speed * hop_s > _HIDDEN_SHARE * track.extent_px)
+
+    def _matched(
+        self, tracks: list[MotionTrack], blobs: Sequence[Blob], t_hop_ns: int
+    ) -> tuple[list[int], list[int]]:
+        """Return each track's blob and each blob's track, -1 for none: the best assignment within the gates."""
+        blob_of, track_of = [-1] * len(tracks), [-1] * len(blobs)
+        first, second, distance2 = self._gated(tracks, positions_at(tracks, t_hop_ns), blobs, t_hop_ns)
+        variance = np.array([track.variance_at(t_hop_ns) for track in tracks])
+        seen = np.array([blob.variance_px2 + 1.0 for blob in blobs])
+        cost = distance2 / (variance[first] + seen[second]) if len(first) else distance2
+        for i, j in assign(first, second, cost, (len(tracks), len(blobs))):
+            blob_of[i], track_of[j] = j, i
+        return blob_of, track_of
+
+    def _find_doubles(self, tracks: list[MotionTrack], t_hop_ns: int) -> None:
+        """Find the tracks that an older one has the events of, or that share its blob, and since when."""
+        if len(tracks) < 2:
+            for track in tracks:
+                track.covered_since_ns = None
+            return
+        centre = positions_at(tracks, t_hop_ns)
+        extent = np.array([track.extent_px for track in tracks])
+        quiet = np.array([track.quiet for track in tracks])
+        distance = np.hypot(*(centre[:, None, :] - centre[None, :, :]).transpose(2, 0, 1))
+        near = distance < _SAME_EXTENTS * np.minimum(extent[:, None], extent[None, :])
+        near |= (distance < extent[None, :]) & quiet[:, None] & ~quiet[None, :]
+        np.fill_diagonal(near, False)
+        some = near.any(axis=1)
+        for i, track in enumerate(tracks):
+            if not some[i]:
+                track.covered_since_ns = None
+                continue
+            older = np.flatnonzero(near[i, :i])
+            covered = len(older[~quiet[older]]) > 0
+            younger = np.flatnonzero(near[i, i + 1 :] & quiet[i] & ~quiet[i + 1 :]) + i + 1
+            if not covered and len(younger):
+                self._take_over(track, tracks[younger[0]])
+                quiet[i] = False
+            if not covered:
+                track.covered_since_ns = None
+            elif track.covered_since_ns is None:
+                track.covered_since_ns = t_hop_ns
+
+    def _take_over(self, older: MotionTrack, younger: MotionTrack) -> None:
+        """Let a quiet track go on where a younger one is."""
+        older.row[:] = younger.row
+        older.settle()
+        older.extent_px, older.index = younger.extent_px, younger.index
+        older.last_seen_ns, older.matched_ns, older.quiet = younger.last_seen_ns, younger.matched_ns, False
+
+    def _may_begin(self, blob: Blob) -> bool:
+        return blob.fresh
+
+    def _make(self, track_id: int, blob: Blob, t_hop_ns: int, tried_ns: int | None) -> Track:
+        track = MotionTrack(
+            track_id, blob.x_px, blob.y_px, blob.t_ns, blob.extent_px, blob.index, blob.t_ns, blob.t_ns,
+            matched_ns=t_hop_ns, tried_ns=tried_ns, origin_ns=t_hop_ns,
+        )  # fmt: skip
+        track.begin(blob.x_px, blob.y_px, blob.t_ns, blob.variance_px2 + 0.05**2, _FIRST_SPEED_PX_PER_S**2)
+        track.row[USUAL] = blob.fresh_count / self._parameters.hop_s
+        return track
