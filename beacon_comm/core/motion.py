@@ -27,12 +27,12 @@ from numba import njit
 STEADY_S = 0.1  # a prediction goes on unchanged for this long …
 FADE_S = 1.0  # … and then fades with this time constant
 
-MODES = 3
-ACCELERATION = np.array([100.0, 2e6, 2e10])  # white acceleration (px²/s³)
-LASTS_S = np.array([1e9, 0.2, 2e-3])  # a mode's acceleration goes on for so long
+MODES = 5
+ACCELERATION = np.array([10.0, 5e3, 4e5, 2e7, 2e10])  # white acceleration (px²/s³)
+LASTS_S = np.array([1e9, 0.5, 0.2, 0.1, 2e-3])  # a mode's acceleration goes on for so long
 # Rate of going over from a mode (row) to another (column) (1/s).
-RATE = np.array([[0.0, 2.0, 0.5], [5.0, 0.0, 2.0], [200.0, 400.0, 0.0]])
-FIRST_WEIGHT = np.array([0.6, 0.3, 0.1])
+RATE = np.array([[0.0, 0.5, 0.1, 0.02, 0.1], [1.0, 0.0, 1.0, 0.1, 0.1], [0.5, 1.0, 0.0, 1.0, 0.1], [0.5, 0.5, 1.0, 0.0, 1.0], [100.0, 100.0, 200.0, 200.0, 0.0]])
+FIRST_WEIGHT = np.array([0.4, 0.2, 0.2, 0.1, 0.1])
 
 # Columns of a row.
 T = 0  # time of the state since the hop (s)
