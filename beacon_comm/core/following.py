@@ -14,6 +14,9 @@ Where two tracks are so near one another that the events of one may be nearer to
 two are together: both take the mean residual of both, and their distance goes on as predicted, so that they pass
 through one another under their own labels instead of pushing one another off.
 
+A light that moves while it is on gives ON events at its front and OFF events at its back.  So an observation is the middle
+between the means of both; a burst of one polarity waits for some events of the other, if that makes a difference.
+
 The events of a track that moves by more than a share of its radius in a hop are hidden from the detection windows:
 there they would be a trail of it, in which false tracks begin.
 
@@ -32,8 +35,7 @@ from beacon_comm.core import motion
 from beacon_comm.core.events import NS_PER_S, EventBatch
 from beacon_comm.core.hop_events import ROUTED, HopEvents
 from beacon_comm.core.motion import (
-    EXTENT, HIDDEN, HOP_OFF, HOP_ON, HOP_RR, HOP_X, HOP_Y, LAST, N, SINCE, SUM_RR, SUM_T, SUM_X, SUM_Y, USUAL, VX, VY, T, X, Y,
-    fading_s, observe, variance_at,
+    EXTENT, HIDDEN, HOP_OFF, HOP_ON, HOP_RR, LAST, LEAD2, LONG_OFF, LONG_ON, N_OFF, N_ON, SINCE, SUM_RR, USUAL, VX, VY, T, X, Y, fading_s, observe, variance_at,
 )  # fmt: skip
 from beacon_comm.core.motion_tracks import MotionTrack
 from beacon_comm.core.nearest import cells_along, list_cells
@@ -46,11 +48,18 @@ UPDATE_EVENTS = 48  # so many events of a track are an observation
 _FEWEST_EVENTS = 4  # at a hop's end so few are one
 _FEWEST_USUAL = 0.2  # less than this share of the usual rate says nothing about the position …
 _LEAST_SPAN_S = 1e-4  # … be it for so long or longer
+_EITHER = 12  # so many of either polarity tell how far they are apart
+_LEAD_GAIN = 0.05
+_BALANCE = 0.2  # a share of ON events so much unlike the usual one is a burst of one polarity …
+_SMALL_LEAD = 1.0  # … worth waiting for the other one where it is off by more than this, over the variance, …
+_MOST_EVENTS = 400  # … for no more than so many events …
+_LONGEST_WAIT_S = 4e-3  # … and no longer than this
 _GROWTH_PX = 12.0  # a circle grows by no more than this
 _SLACK_PX = 3.0  # a path may change by this within a step before the cells are listed again
 _LEAST_SPREAD_PX2 = 0.1  # variance of the events of a single pixel, and more
 _HIDDEN = np.uint32(0xFFFF_FFFF)  # code of an event that the windows do not get
-# Columns of a path: centre (px) at the step's begin, velocity (px/s), radius squared (px²), box that is listed, partner.
+# Columns of a path: centre (px) at the step's begin, velocity (px/s), radius squared (px²), box that is listed,
+# radius.
 _PX, _PY, _PVX, _PVY, _RR, _LEFT, _RIGHT, _TOP, _BOTTOM, _RADIUS = range(10)
 
 
@@ -103,7 +112,7 @@ class FollowingRouter(Router):
 
     def settle(self) -> None:
         """Tell the tracks what the events since the last hop say about them."""
-        for k in np.flatnonzero(self._state[:, HOP_ON] + self._state[:, HOP_OFF]):
+        for k in np.flatnonzero(self._state[:, HOP_OFF] + self._state[:, HOP_ON]):
             self._tracks[k].settle()
 
 
@@ -116,20 +125,19 @@ def _follow(  # type: ignore[no-untyped-def]
     across, down = cells_along_(width), cells_along_(height)
     step_s = step_ns * 1e-9
     routed = np.int64(0)
-    n = len(x)
     i = 0
-    while i < n:
+    while i < len(x):
         now = (t_ns[i] - t_hop_ns) // step_ns
         if now != step[0]:
             step[0] = now
             for k in range(len(state)):
-                _lead(state[k], path[k], now * step_s, step_s, factor, margin)
+                _lay(state[k], path[k], now * step_s, step_s, factor, margin)
                 _box(path[k], step_s)
             _find_partners(path, state, partner)
             first, member = list_cells(path[:, _LEFT : _BOTTOM + 1], width, height, across, down)
         end_ns = t_hop_ns + (now + 1) * step_ns
         begin_s = now * step_s
-        while i < n and t_ns[i] < end_ns:
+        while i < len(x) and t_ns[i] < end_ns:
             cell = cell_of(x[i], y[i], across)
             at, stop = first[cell], first[cell + np.uint64(1)]
             if at == stop:
@@ -154,28 +162,27 @@ def _follow(  # type: ignore[no-untyped-def]
                 row = state[best]
                 if row[HIDDEN] > 0:
                     code[i] = _HIDDEN
-                if polarity[i] > 0:
-                    row[HOP_ON] += 1.0
-                else:
-                    row[HOP_OFF] += 1.0
-                row[HOP_X] += best_x
-                row[HOP_Y] += best_y
+                if row[N_OFF] + row[N_ON] == 0.0:
+                    row[SINCE] = t_s
+                on = np.int64(polarity[i] > 0)
+                own = N_OFF + 4 * on
+                row[own] += 1.0
+                row[own + 1] += best_x
+                row[own + 2] += best_y
+                row[own + 3] += t_s
+                row[SUM_RR] += nearest2
+                row[HOP_OFF + on] += 1.0
                 row[HOP_RR] += nearest2
                 row[LAST] = t_s
-                if row[N] == 0.0:
-                    row[SINCE] = t_s
-                row[N] += 1.0
-                row[SUM_X] += best_x
-                row[SUM_Y] += best_y
-                row[SUM_T] += t_s
-                row[SUM_RR] += nearest2
                 other = partner[best]
-                if row[N] + (state[other, N] if other >= 0 else 0.0) >= UPDATE_EVENTS:
-                    _update(state, best, other)
-                    _lead(row, path[best], begin_s, step_s, factor, margin)
+                n = row[N_OFF] + row[N_ON]
+                if other >= 0:
+                    n += state[other, N_OFF] + state[other, N_ON]
+                if n >= UPDATE_EVENTS and _update(state, best, other, False):
+                    _lay(row, path[best], begin_s, step_s, factor, margin)
                     fits = _is_in_box(path[best], step_s)
                     if other >= 0:
-                        _lead(state[other], path[other], begin_s, step_s, factor, margin)
+                        _lay(state[other], path[other], begin_s, step_s, factor, margin)
                         fits &= _is_in_box(path[other], step_s)
                     if not fits:
                         for k in range(len(state)):
@@ -191,14 +198,15 @@ def cells_along_(length_px):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _lead(row, path, begin_s, step_s, factor, margin):  # type: ignore[no-untyped-def]
+def _lay(row, path, begin_s, step_s, factor, margin):  # type: ignore[no-untyped-def]
     """Lay a track's path through a step that begins at ``begin_s`` (s)."""
     here, there = fading_s(begin_s - row[T]), fading_s(begin_s + step_s - row[T])
     share = (there - here) / step_s
     path[_PX], path[_PY] = row[X] + row[VX] * here, row[Y] + row[VY] * here
     path[_PVX], path[_PVY] = row[VX] * share, row[VY] * share
     unseen_s = max(0.0, begin_s + 0.5 * step_s - row[T])
-    growth = 3.0 * np.sqrt(max(0.0, variance_at(row, unseen_s))) + 2.0 * np.hypot(row[VX], row[VY]) * unseen_s
+    speed = np.hypot(row[VX], row[VY])
+    growth = 3.0 * np.sqrt(max(0.0, variance_at(row, unseen_s))) + 2.0 * speed * unseen_s
     radius = row[EXTENT] * factor + margin + min(growth, _GROWTH_PX)
     path[_RADIUS] = radius
     path[_RR] = radius * radius
@@ -243,32 +251,56 @@ def _find_partners(path, state, partner):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _update(state, k, other):  # type: ignore[no-untyped-def]
-    """Let a track take its sums as an observation, together with its partner, if it has one."""
+def _update(state, k, other, at_once):  # type: ignore[no-untyped-def]
+    """Let a track take its sums as an observation, together with its partner, if it has one; return whether it did.
+
+    ``at_once``: do not wait for the other polarity.
+    """
     row = state[k]
-    n, sx, sy, st, rr, since, usual = row[N], row[SUM_X], row[SUM_Y], row[SUM_T], row[SUM_RR], row[SINCE], row[USUAL]
-    row[N : SINCE + 1] = 0.0
+    sums, since, usual = row[N_OFF : SUM_RR + 1].copy(), row[SINCE], row[USUAL]
+    if other >= 0 and state[other, N_OFF] + state[other, N_ON] > 0.0:
+        sums += state[other, N_OFF : SUM_RR + 1]
+        since, usual = min(since, state[other, SINCE]), usual + state[other, USUAL]
+    off, on = sums[0], sums[4]
+    n = off + on
+    age_s = row[LAST] - since
+    if n < _FEWEST_USUAL * usual * max(age_s, _LEAST_SPAN_S):  # a few of the background's, while it is dark
+        if at_once or n >= 2 * UPDATE_EVENTS or age_s > _LONGEST_WAIT_S:
+            _forget(state, k, other)
+        return False
+    dx, dy, dt = (sums[1] + sums[5]) / n, (sums[2] + sums[6]) / n, (sums[3] + sums[7]) / n
+    spread = max(0.5 * (sums[8] / n - dx * dx - dy * dy), _LEAST_SPREAD_PX2)
+    variance = spread / n
+    if min(off, on) >= _EITHER:
+        lead_x, lead_y = 0.5 * (sums[5] / on - sums[1] / off), 0.5 * (sums[6] / on - sums[2] / off)
+        lead2 = lead_x * lead_x + lead_y * lead_y - 0.5 * spread * (1.0 / off + 1.0 / on)
+        row[LEAD2] += _LEAD_GAIN * (max(lead2, 0.0) - row[LEAD2])
+    usual_on = (row[LONG_ON] + 1.0) / (row[LONG_ON] + row[LONG_OFF] + 2.0)
+    more = 2.0 * (on / n - usual_on)
+    lead2 = row[LEAD2] * more * more
+    if lead2 > _SMALL_LEAD * variance and abs(more) > _BALANCE and n < _MOST_EVENTS and age_s < _LONGEST_WAIT_S and not at_once:
+        return False
+    variance += 0.5 * lead2
+    _forget(state, k, other)
+    observe(row, dt, dx, dy, variance, 1.0 if other < 0 else 0.5)
     if other >= 0:
-        o = state[other]
-        if o[N] > 0.0:
-            n, sx, sy, st, rr = n + o[N], sx + o[SUM_X], sy + o[SUM_Y], st + o[SUM_T], rr + o[SUM_RR]
-            since, usual = min(since, o[SINCE]), usual + o[USUAL]
-            o[N : SINCE + 1] = 0.0
-    if n < _FEWEST_USUAL * usual * max(row[LAST] - since, _LEAST_SPAN_S):
-        return  # a few of the background's, while it is dark
-    dx, dy = sx / n, sy / n
-    spread = max(0.5 * (rr / n - dx * dx - dy * dy), _LEAST_SPREAD_PX2)
-    observe(row, st / n, dx, dy, spread / n, 1.0 if other < 0 else 0.5)
+        observe(state[other], dt, dx, dy, variance, 0.5)
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _forget(state, k, other):  # type: ignore[no-untyped-def]
+    state[k, N_OFF : SINCE + 1] = 0.0
     if other >= 0:
-        observe(state[other], st / n, dx, dy, spread / n, 0.5)
+        state[other, N_OFF : SINCE + 1] = 0.0
 
 
 @njit(cache=True, nogil=True)
 def _close(state, partner):  # type: ignore[no-untyped-def]
     """Take what is left of the hop's events."""
     for k in range(len(state)):
-        if state[k, N] >= _FEWEST_EVENTS:
-            _update(state, k, partner[k])
+        if state[k, N_OFF] + state[k, N_ON] >= _FEWEST_EVENTS:
+            _update(state, k, partner[k], state[k, LEAD2] == 0.0)
 
 
 @njit(cache=True, nogil=True)

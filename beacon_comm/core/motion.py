@@ -40,15 +40,18 @@ _MODE = 1  # x, y, vx, vy, pp, pv, vv of each mode
 _SIZE = 7
 _WEIGHT = _MODE + MODES * _SIZE
 X, Y, VX, VY, PP, PV, VV, NOISE = range(_WEIGHT + MODES, _WEIGHT + MODES + 8)
-# SUMS since the last update: events, residuals to the path (px), time (s), squared residual (px²), first event (s).
-N, SUM_X, SUM_Y, SUM_T, SUM_RR, SINCE = range(NOISE + 1, NOISE + 7)
-# SUMS of the hop: ON and OFF events, residuals, squared residual, and the time of the last event (s).
-HOP_ON, HOP_OFF, HOP_X, HOP_Y, HOP_RR, LAST = range(SINCE + 1, SINCE + 7)
+# SUMS since the last update, first of the OFF, then of the ON events: number, residuals to the path (px), time (s); …
+N_OFF, OFF_X, OFF_Y, OFF_T, N_ON, ON_X, ON_Y, ON_T = range(NOISE + 1, NOISE + 9)
+# … and of all: squared residual (px²), and the time of the first one (s).
+SUM_RR, SINCE = range(ON_T + 1, ON_T + 3)
+# SUMS of the hop: OFF and ON events, squared residual, and the time of the last event (s).
+HOP_OFF, HOP_ON, HOP_RR, LAST = range(SINCE + 1, SINCE + 5)
 # ON and OFF events in windows that forget like the short and the long one.
 SHORT_ON, SHORT_OFF, LONG_ON, LONG_OFF = range(LAST + 1, LAST + 5)
-# Radius (px), whether the windows do not get its events, and how many events a second are usual.
-EXTENT, HIDDEN, USUAL = range(LONG_OFF + 1, LONG_OFF + 4)
-WIDTH = USUAL + 1
+# Radius (px), whether the windows do not get its events, how many events a second are usual, and the square of how
+# far ON events come before the centre and OFF events behind it (px²).
+EXTENT, HIDDEN, USUAL, LEAD2 = range(LONG_OFF + 1, LONG_OFF + 5)
+WIDTH = LEAD2 + 1
 
 
 @njit(cache=True, nogil=True)
@@ -68,7 +71,7 @@ def begin(row, t_s, x, y, vx, vy, variance, speed_variance):  # type: ignore[no-
         row[at], row[at + 1], row[at + 2], row[at + 3] = x, y, vx, vy
         row[at + 4], row[at + 5], row[at + 6] = variance, 0.0, speed_variance
         row[_WEIGHT + j] = FIRST_WEIGHT[j]
-    row[N : SINCE + 1] = 0.0
+    row[N_OFF : SINCE + 1] = 0.0
     _combine(row)
 
 
@@ -88,7 +91,8 @@ def rebase(row, later_s):  # type: ignore[no-untyped-def]
     row[T] -= later_s
     row[LAST] -= later_s
     row[SINCE] -= later_s
-    row[SUM_T] -= row[N] * later_s
+    row[OFF_T] -= row[N_OFF] * later_s
+    row[ON_T] -= row[N_ON] * later_s
 
 
 @njit(cache=True, nogil=True)
@@ -171,7 +175,7 @@ def observe(row, t_s, dx, dy, variance, share):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _combine(row):  # type: ignore[no-untyped-def]
     """Sum the modes up: mean, variance of an axis with the spread of the means, and white acceleration."""
-    row[X:WIDTH][: NOISE + 1 - X] = 0.0
+    row[X : NOISE + 1] = 0.0
     for j in range(MODES):
         w, at = row[_WEIGHT + j], _MODE + j * _SIZE
         for k in range(4):

@@ -23,8 +23,7 @@ from beacon_comm.core.blobs import Blob
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.index_image import whole_hops
 from beacon_comm.core.motion import (
-    EXTENT, HIDDEN, HOP_OFF, HOP_ON, HOP_RR, HOP_X, HOP_Y, LAST, LONG_OFF, LONG_ON, NOISE, PP, PV, SHORT_OFF, SHORT_ON,
-    USUAL, VV, VX, VY, T, X, Y,
+    EXTENT, HIDDEN, HOP_OFF, HOP_ON, HOP_RR, LAST, LONG_OFF, LONG_ON, NOISE, SHORT_OFF, SHORT_ON, USUAL, T, X,
 )  # fmt: skip
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.tracks import Track, TrackChanges, Tracker, positions_at
@@ -59,7 +58,7 @@ class MotionTrack(Track):
         """Return the row for the hop interval that begins at ``t_hop_ns`` (ns), with the hop's sums at zero."""
         motion.rebase(self.row, (t_hop_ns - self.origin_ns) / NS_PER_S)
         self.origin_ns = t_hop_ns
-        self.row[HOP_ON : HOP_RR + 1] = 0.0
+        self.row[HOP_OFF : HOP_RR + 1] = 0.0
         self.row[EXTENT] = self.extent_px
         return self.row
 
@@ -149,8 +148,7 @@ class MotionTracker(Tracker):
             n, difference = rows[:, on] + rows[:, off], np.abs(rows[:, on] - rows[:, off])
             index = np.maximum(index, n / (self._parameters.index_offset * area + difference))
         n = np.maximum(own, 1.0)
-        mean2 = (rows[:, HOP_X] ** 2 + rows[:, HOP_Y] ** 2) / n**2
-        return own, index, np.sqrt(2.0 * np.maximum(rows[:, HOP_RR] / n - mean2, 0.0))
+        return own, index, np.sqrt(2.0 * rows[:, HOP_RR] / n)
 
     def _see(
         self, track: MotionTrack, blob: Blob | None, t_hop_ns: int, own: float, index: float, spread: float, seen: bool
