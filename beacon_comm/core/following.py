@@ -10,9 +10,10 @@ An event is of the nearest track whose circle holds it, both at the event's own 
 
 since something that turns back at a border is twice its speed away from where it was expected.
 
-Where two tracks are so near one another that the events of one may be nearer to the other, events tell only where the
-two are together: both take the mean residual of both, and their distance goes on as predicted, so that they pass
-through one another under their own labels instead of pushing one another off.
+Where two tracks are so near one another that the events of one may be nearer to the other, an event moves both, each by
+how likely it is its own, as the predicted distances say (expectation maximisation, Dempster et al., 1977): where the two
+are one spot, both move as it does and their distance goes on as predicted.  Shared out to the nearer one alone, they would push
+one another off instead of passing through one another, and leave with each other's label.
 
 A light that moves while it is on gives ON events at its front and OFF events at its back.  So an observation is the middle
 between the means of both; a burst of one polarity waits for some events of the other, if that makes a difference.
@@ -25,6 +26,7 @@ What is done depends on the events in their order alone: any batching gives the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -48,6 +50,7 @@ UPDATE_EVENTS = 48  # so many events of a track are an observation
 _FEWEST_EVENTS = 4  # at a hop's end so few are one
 _FEWEST_USUAL = 0.2  # less than this share of the usual rate says nothing about the position …
 _LEAST_SPAN_S = 1e-4  # … be it for so long or longer
+_SHARED = 2.0  # events that may be another track's tell so much less
 _EITHER = 12  # so many of either polarity tell how far they are apart
 _LEAD_GAIN = 0.05
 _BALANCE = 0.2  # a share of ON events so much unlike the usual one is a burst of one polarity …
@@ -162,32 +165,31 @@ def _follow(  # type: ignore[no-untyped-def]
                 row = state[best]
                 if row[HIDDEN] > 0:
                     code[i] = _HIDDEN
-                if row[N_OFF] + row[N_ON] == 0.0:
-                    row[SINCE] = t_s
                 on = np.int64(polarity[i] > 0)
-                own = N_OFF + 4 * on
-                row[own] += 1.0
-                row[own + 1] += best_x
-                row[own + 2] += best_y
-                row[own + 3] += t_s
-                row[SUM_RR] += nearest2
                 row[HOP_OFF + on] += 1.0
                 row[HOP_RR] += nearest2
                 row[LAST] = t_s
                 other = partner[best]
-                n = row[N_OFF] + row[N_ON]
+                fits = True
                 if other >= 0:
-                    n += state[other, N_OFF] + state[other, N_ON]
-                if n >= UPDATE_EVENTS and _update(state, best, other, False):
-                    _lay(row, path[best], begin_s, step_s, factor, margin)
-                    fits = _is_in_box(path[best], step_s)
-                    if other >= 0:
+                    dx = ex - (path[other, _PX] + path[other, _PVX] * dt)
+                    dy = ey - (path[other, _PY] + path[other, _PVY] * dt)
+                    scale = 2.0 / min(row[EXTENT], state[other, EXTENT]) ** 2  # 1 / 2σ² of a disc, σ = R / 2
+                    theirs = 1.0 / (1.0 + math.exp(min(scale * (dx * dx + dy * dy - nearest2), 50.0)))
+                    _add(state[other], on, theirs, dx, dy, t_s)
+                    _add(row, on, 1.0 - theirs, best_x, best_y, t_s)
+                    if state[other, N_OFF] + state[other, N_ON] >= UPDATE_EVENTS and _update(state[other], _SHARED, False):
                         _lay(state[other], path[other], begin_s, step_s, factor, margin)
-                        fits &= _is_in_box(path[other], step_s)
-                    if not fits:
-                        for k in range(len(state)):
-                            _box(path[k], step_s)
-                        first, member = list_cells(path[:, _LEFT : _BOTTOM + 1], width, height, across, down)
+                        fits = _is_in_box(path[other], step_s)
+                else:
+                    _add(row, on, 1.0, best_x, best_y, t_s)
+                if row[N_OFF] + row[N_ON] >= UPDATE_EVENTS and _update(row, _SHARED if other >= 0 else 1.0, False):
+                    _lay(row, path[best], begin_s, step_s, factor, margin)
+                    fits &= _is_in_box(path[best], step_s)
+                if not fits:
+                    for k in range(len(state)):
+                        _box(path[k], step_s)
+                    first, member = list_cells(path[:, _LEFT : _BOTTOM + 1], width, height, across, down)
             i += 1
     return routed, first, member
 
@@ -251,22 +253,31 @@ def _find_partners(path, state, partner):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _update(state, k, other, at_once):  # type: ignore[no-untyped-def]
-    """Let a track take its sums as an observation, together with its partner, if it has one; return whether it did.
+def _add(row, on, weight, dx, dy, t_s):  # type: ignore[no-untyped-def]
+    """Add an event, or a share of one, to a track's sums."""
+    if row[N_OFF] + row[N_ON] == 0.0:
+        row[SINCE] = t_s
+    own = N_OFF + 4 * on
+    row[own] += weight
+    row[own + 1] += weight * dx
+    row[own + 2] += weight * dy
+    row[own + 3] += weight * t_s
+    row[SUM_RR] += weight * (dx * dx + dy * dy)
 
-    ``at_once``: do not wait for the other polarity.
+
+@njit(cache=True, nogil=True)
+def _update(row, doubt, at_once):  # type: ignore[no-untyped-def]
+    """Let a track take its sums as an observation; return whether it did.
+
+    ``doubt``: factor of the variance.  ``at_once``: do not wait for the other polarity.
     """
-    row = state[k]
-    sums, since, usual = row[N_OFF : SUM_RR + 1].copy(), row[SINCE], row[USUAL]
-    if other >= 0 and state[other, N_OFF] + state[other, N_ON] > 0.0:
-        sums += state[other, N_OFF : SUM_RR + 1]
-        since, usual = min(since, state[other, SINCE]), usual + state[other, USUAL]
+    sums = row[N_OFF : SUM_RR + 1]
     off, on = sums[0], sums[4]
     n = off + on
-    age_s = row[LAST] - since
-    if n < _FEWEST_USUAL * usual * max(age_s, _LEAST_SPAN_S):  # a few of the background's, while it is dark
+    age_s = row[LAST] - row[SINCE]
+    if n < _FEWEST_USUAL * row[USUAL] * max(age_s, _LEAST_SPAN_S):  # a few of the background's, while it is dark
         if at_once or n >= 2 * UPDATE_EVENTS or age_s > _LONGEST_WAIT_S:
-            _forget(state, k, other)
+            row[N_OFF : SINCE + 1] = 0.0
         return False
     dx, dy, dt = (sums[1] + sums[5]) / n, (sums[2] + sums[6]) / n, (sums[3] + sums[7]) / n
     spread = max(0.5 * (sums[8] / n - dx * dx - dy * dy), _LEAST_SPREAD_PX2)
@@ -281,18 +292,9 @@ def _update(state, k, other, at_once):  # type: ignore[no-untyped-def]
     if lead2 > _SMALL_LEAD * variance and abs(more) > _BALANCE and n < _MOST_EVENTS and age_s < _LONGEST_WAIT_S and not at_once:
         return False
     variance += 0.5 * lead2
-    _forget(state, k, other)
-    observe(row, dt, dx, dy, variance, 1.0 if other < 0 else 0.5)
-    if other >= 0:
-        observe(state[other], dt, dx, dy, variance, 0.5)
+    row[N_OFF : SINCE + 1] = 0.0
+    observe(row, dt, dx, dy, variance * doubt)
     return True
-
-
-@njit(cache=True, nogil=True)
-def _forget(state, k, other):  # type: ignore[no-untyped-def]
-    state[k, N_OFF : SINCE + 1] = 0.0
-    if other >= 0:
-        state[other, N_OFF : SINCE + 1] = 0.0
 
 
 @njit(cache=True, nogil=True)
@@ -300,7 +302,7 @@ def _close(state, partner):  # type: ignore[no-untyped-def]
     """Take what is left of the hop's events."""
     for k in range(len(state)):
         if state[k, N_OFF] + state[k, N_ON] >= _FEWEST_EVENTS:
-            _update(state, k, partner[k], state[k, LEAD2] == 0.0)
+            _update(state[k], _SHARED if partner[k] >= 0 else 1.0, state[k, LEAD2] == 0.0)
 
 
 @njit(cache=True, nogil=True)

@@ -102,11 +102,10 @@ def variance_at(row, dt_s):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def observe(row, t_s, dx, dy, variance, share):  # type: ignore[no-untyped-def]
+def observe(row, t_s, dx, dy, variance):  # type: ignore[no-untyped-def]
     """Take an observation at ``t_s`` (s).
 
-    ``dx``, ``dy``: its residual to the combined path (px).  ``variance``: of an axis (px²).  ``share``: 1, or how much of
-    the state's own error is in the observation: 1/2 for the mean of two tracks.
+    ``dx``, ``dy``: its residual to the combined path (px).  ``variance``: of an axis (px²).
     """
     dt = max(0.0, t_s - row[T])
     s = fading_s(dt)
@@ -152,16 +151,16 @@ def observe(row, t_s, dx, dy, variance, share):  # type: ignore[no-untyped-def]
         pp += dt * (2.0 * pv + dt * (vv + q * dt / 3.0))
         pv += dt * (vv + q * dt / 2.0)
         vv += q * dt
-        expected = share * pp + variance
+        expected = pp + variance
         ex, ey = zx - x, zy - y
         fit[j] = -0.5 * (ex * ex + ey * ey) / expected - math.log(expected)
         best = max(best, fit[j])
-        kp, kv = share * pp / expected, share * pv / expected
+        kp, kv = pp / expected, pv / expected
         row[at], row[at + 1] = x + kp * ex, y + kp * ey
         row[at + 2], row[at + 3] = vx + kv * ex, vy + kv * ey
-        row[at + 4] = pp - kp * share * pp
-        row[at + 5] = pv - kp * share * pv
-        row[at + 6] = vv - kv * share * pv
+        row[at + 4] = pp - kp * pp
+        row[at + 5] = pv - kp * pv
+        row[at + 6] = vv - kv * pv
     total = 0.0
     for j in range(MODES):
         weight[j] = max(weight[j] * math.exp(fit[j] - best), 1e-12)

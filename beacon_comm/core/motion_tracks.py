@@ -82,7 +82,7 @@ class MotionTrack(Track):
             speed2 = self.vx_px_per_s**2 + self.vy_px_per_s**2
             self.begin(x_px, y_px, t_ns, variance_px2, _FIRST_SPEED_PX_PER_S**2 + speed2)
             return
-        motion.observe(self.row, (t_ns - self.origin_ns) / NS_PER_S, x_px - x, y_px - y, variance_px2, 1.0)
+        motion.observe(self.row, (t_ns - self.origin_ns) / NS_PER_S, x_px - x, y_px - y, variance_px2)
         self.settle()
 
     def fall_quiet(self) -> None:
