@@ -37,7 +37,7 @@ from beacon_comm.core import motion
 from beacon_comm.core.events import NS_PER_S, EventBatch
 from beacon_comm.core.hop_events import ROUTED, HopEvents
 from beacon_comm.core.motion import (
-    EXTENT, HIDDEN, HOP_OFF, HOP_ON, HOP_RR, LAST, LEAD2, LONG_OFF, LONG_ON, N_OFF, N_ON, SINCE, SUM_RR, USUAL, VX, VY, T, X, Y, fading_s, observe, variance_at,
+    EXTENT, HIDDEN, HOP_OFF, HOP_ON, HOP_RR, LAST, LEAD2, LONG_OFF, LONG_ON, N_OFF, N_ON, SINCE, SUM_RR, TRUST, USUAL, VX, VY, T, X, Y, fading_s, observe, variance_at,
 )  # fmt: skip
 from beacon_comm.core.motion_tracks import MotionTrack
 from beacon_comm.core.nearest import cells_along, list_cells
@@ -50,6 +50,10 @@ UPDATE_EVENTS = 48  # so many events of a track are an observation
 _FEWEST_EVENTS = 4  # at a hop's end so few are one
 _FEWEST_USUAL = 0.2  # less than this share of the usual rate says nothing about the position …
 _LEAST_SPAN_S = 1e-4  # … be it for so long or longer
+# The variance of observations is learnt from their errors, within bounds: a burst's events are of all pixels alike, which
+# says more than as many at random, and of one moment, which says less.
+_TRUST_GAIN, _MOST_ERROR = 0.03, 5.0
+_LEAST_TRUST, _MOST_TRUST = 0.15, 2.0
 _SHARED = 2.0  # events that may be another track's tell so much less
 _EITHER = 12  # so many of either polarity tell how far they are apart
 _LEAD_GAIN = 0.05
@@ -57,9 +61,11 @@ _BALANCE = 0.2  # a share of ON events so much unlike the usual one is a burst o
 _SMALL_LEAD = 1.0  # … worth waiting for the other one where it is off by more than this, over the variance, …
 _MOST_EVENTS = 400  # … for no more than so many events …
 _LONGEST_WAIT_S = 4e-3  # … and no longer than this
+_SHORTEST_S = 1e-4  # a burst is read out row by row: its first events are of the upper rows
 _GROWTH_PX = 12.0  # a circle grows by no more than this
 _SLACK_PX = 3.0  # a path may change by this within a step before the cells are listed again
 _LEAST_SPREAD_PX2 = 0.1  # variance of the events of a single pixel, and more
+_PRIOR_EVENTS = 16  # that the blob's own extent counts for in the variance of few events
 _HIDDEN = np.uint32(0xFFFF_FFFF)  # code of an event that the windows do not get
 # Columns of a path: centre (px) at the step's begin, velocity (px/s), radius squared (px²), box that is listed,
 # radius.
@@ -275,13 +281,16 @@ def _update(row, doubt, at_once):  # type: ignore[no-untyped-def]
     off, on = sums[0], sums[4]
     n = off + on
     age_s = row[LAST] - row[SINCE]
+    if age_s < _SHORTEST_S and n < _MOST_EVENTS and not at_once:
+        return False
     if n < _FEWEST_USUAL * row[USUAL] * max(age_s, _LEAST_SPAN_S):  # a few of the background's, while it is dark
         if at_once or n >= 2 * UPDATE_EVENTS or age_s > _LONGEST_WAIT_S:
             row[N_OFF : SINCE + 1] = 0.0
         return False
     dx, dy, dt = (sums[1] + sums[5]) / n, (sums[2] + sums[6]) / n, (sums[3] + sums[7]) / n
-    spread = max(0.5 * (sums[8] / n - dx * dx - dy * dy), _LEAST_SPREAD_PX2)
-    variance = spread / n
+    spread = 0.5 * max(sums[8] - n * (dx * dx + dy * dy), 0.0)
+    spread = max((spread + _PRIOR_EVENTS * 0.25 * row[EXTENT] ** 2) / (n + _PRIOR_EVENTS), _LEAST_SPREAD_PX2)
+    variance = (row[TRUST] if n >= UPDATE_EVENTS else 1.0) * spread / n
     if min(off, on) >= _EITHER:
         lead_x, lead_y = 0.5 * (sums[5] / on - sums[1] / off), 0.5 * (sums[6] / on - sums[2] / off)
         lead2 = lead_x * lead_x + lead_y * lead_y - 0.5 * spread * (1.0 / off + 1.0 / on)
@@ -293,7 +302,10 @@ def _update(row, doubt, at_once):  # type: ignore[no-untyped-def]
         return False
     variance += 0.5 * lead2
     row[N_OFF : SINCE + 1] = 0.0
-    observe(row, dt, dx, dy, variance * doubt)
+    error, part = observe(row, dt, dx, dy, variance * doubt)
+    if doubt == 1.0:
+        trust = row[TRUST] * math.exp(_TRUST_GAIN * part * (min(error, _MOST_ERROR) - 1.0))
+        row[TRUST] = min(max(trust, _LEAST_TRUST), _MOST_TRUST)
     return True
 
 

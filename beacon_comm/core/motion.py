@@ -32,6 +32,7 @@ ACCELERATION = np.array([10.0, 5e3, 4e5, 2e7, 2e10])  # white acceleration (px²
 LASTS_S = np.array([1e9, 0.5, 0.2, 0.1, 2e-3])  # a mode's acceleration goes on for so long
 # Rate of going over from a mode (row) to another (column) (1/s).
 RATE = np.array([[0.0, 0.5, 0.1, 0.02, 0.1], [1.0, 0.0, 1.0, 0.1, 0.1], [0.5, 1.0, 0.0, 1.0, 0.1], [0.5, 0.5, 1.0, 0.0, 1.0], [100.0, 100.0, 200.0, 200.0, 0.0]])
+_LIKELY = 0.02  # less likely modes are no part of a prediction's variance
 FIRST_WEIGHT = np.array([0.4, 0.2, 0.2, 0.1, 0.1])
 
 # Columns of a row.
@@ -49,9 +50,9 @@ HOP_OFF, HOP_ON, HOP_RR, LAST = range(SINCE + 1, SINCE + 5)
 # ON and OFF events in windows that forget like the short and the long one.
 SHORT_ON, SHORT_OFF, LONG_ON, LONG_OFF = range(LAST + 1, LAST + 5)
 # Radius (px), whether the windows do not get its events, how many events a second are usual, and the square of how
-# far ON events come before the centre and OFF events behind it (px²).
-EXTENT, HIDDEN, USUAL, LEAD2 = range(LONG_OFF + 1, LONG_OFF + 5)
-WIDTH = LEAD2 + 1
+# far ON events come before the centre and OFF events behind it (px²), and the variance of its observations over what independent events have.
+EXTENT, HIDDEN, USUAL, LEAD2, TRUST = range(LONG_OFF + 1, LONG_OFF + 6)
+WIDTH = TRUST + 1
 
 
 @njit(cache=True, nogil=True)
@@ -103,14 +104,14 @@ def variance_at(row, dt_s):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def observe(row, t_s, dx, dy, variance):  # type: ignore[no-untyped-def]
-    """Take an observation at ``t_s`` (s).
+    """Take an observation at ``t_s`` (s); return its squared error over the expected one, and the observation's part of that.
 
     ``dx``, ``dy``: its residual to the combined path (px).  ``variance``: of an axis (px²).
     """
     dt = max(0.0, t_s - row[T])
     s = fading_s(dt)
     zx, zy = row[X] + row[VX] * s + dx, row[Y] + row[VY] * s + dy
-    old = row[_MODE:_WEIGHT].copy()
+    old = row[_MODE : _WEIGHT + MODES].copy()
     stay = np.empty(MODES)
     for i in range(MODES):
         out = 0.0
@@ -118,7 +119,7 @@ def observe(row, t_s, dx, dy, variance):  # type: ignore[no-untyped-def]
             out += RATE[i, j]
         stay[i] = math.exp(-out * dt)
     weight, fit = np.empty(MODES), np.empty(MODES)
-    best = -np.inf
+    best, error, part_of, heaviest = -np.inf, 1.0, 0.0, 0.0
     for j in range(MODES):
         total = 0.0
         part = np.empty(MODES)
@@ -155,6 +156,9 @@ def observe(row, t_s, dx, dy, variance):  # type: ignore[no-untyped-def]
         ex, ey = zx - x, zy - y
         fit[j] = -0.5 * (ex * ex + ey * ey) / expected - math.log(expected)
         best = max(best, fit[j])
+        if old[_WEIGHT - _MODE + j] >= heaviest:
+            heaviest = old[_WEIGHT - _MODE + j]
+            error, part_of = 0.5 * (ex * ex + ey * ey) / expected, variance / expected
         kp, kv = pp / expected, pv / expected
         row[at], row[at + 1] = x + kp * ex, y + kp * ey
         row[at + 2], row[at + 3] = vx + kv * ex, vy + kv * ey
@@ -169,6 +173,7 @@ def observe(row, t_s, dx, dy, variance):  # type: ignore[no-untyped-def]
         row[_WEIGHT + j] = weight[j] / total
     row[T] += dt
     _combine(row)
+    return error, part_of
 
 
 @njit(cache=True, nogil=True)
@@ -179,7 +184,8 @@ def _combine(row):  # type: ignore[no-untyped-def]
         w, at = row[_WEIGHT + j], _MODE + j * _SIZE
         for k in range(4):
             row[X + k] += w * row[at + k]
-        row[NOISE] += w * ACCELERATION[j]
+        if w > _LIKELY:
+            row[NOISE] += w * ACCELERATION[j]
     for j in range(MODES):
         w, at = row[_WEIGHT + j], _MODE + j * _SIZE
         ex, ey, evx, evy = row[at] - row[X], row[at + 1] - row[Y], row[at + 2] - row[VX], row[at + 3] - row[VY]

@@ -11,6 +11,7 @@ detection's short and long one, so that a fast one has an index, too.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -23,7 +24,7 @@ from beacon_comm.core.blobs import Blob
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.index_image import whole_hops
 from beacon_comm.core.motion import (
-    EXTENT, HIDDEN, HOP_OFF, HOP_ON, HOP_RR, LAST, LONG_OFF, LONG_ON, NOISE, SHORT_OFF, SHORT_ON, USUAL, T, X,
+    EXTENT, HIDDEN, HOP_OFF, HOP_ON, HOP_RR, LAST, LONG_OFF, LONG_ON, NOISE, SHORT_OFF, SHORT_ON, TRUST, USUAL, T, X,
 )  # fmt: skip
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.tracks import Track, TrackChanges, Tracker, positions_at
@@ -39,7 +40,10 @@ _HIDDEN_AFTER_HOPS = 2
 _FIRST_SPEED_PX_PER_S = 200.0
 _SURPRISE = 16.0  # a blob more than 4 standard deviations away: begin anew there
 _SAME_EXTENTS = 1.1  # two tracks of one blob are half a disc's centroids apart: 0.85 radii
-_KNOWN_AFTER_NS = 100_000_000
+_GRAIN_PX = 0.065  # a spot's centroid is off by so much because its pixels differ
+_GRAIN_SPEED_PX_PER_S = 50.0  # at this speed half of that is averaged out: a pixel in the filter's memory
+_EDGES_PX_PER_S = 500.0  # at this speed half of the latency shows
+_LATENCY_SHARE = 0.25  # of the latency is its standard deviation
 
 
 @dataclass(slots=True)
@@ -49,10 +53,12 @@ class MotionTrack(Track):
     Attributes:
         row: its state, see :mod:`.motion`.
         origin_ns: the hop that the row's times count from (ns).
+        latency_s: of the sensor (s): how much later than the light an event is.
     """
 
     row: NDArray[np.float64] = field(default_factory=lambda: np.zeros(motion.WIDTH))
     origin_ns: int = 0
+    latency_s: float = 0.0
 
     def aimed(self, t_hop_ns: int) -> NDArray[np.float64]:
         """Return the row for the hop interval that begins at ``t_hop_ns`` (ns), with the hop's sums at zero."""
@@ -68,6 +74,28 @@ class MotionTrack(Track):
         self.x_px, self.y_px, self.vx_px_per_s, self.vy_px_per_s = x, y, vx, vy
         self.t_ns = self.origin_ns + round(float(self.row[T]) * NS_PER_S)
         self.variance, self.noise = (pp, pv, vv), noise
+
+    def light_at(self, t_ns: int) -> tuple[float, float]:
+        """Return the predicted centre of the light (px) at ``t_ns`` (ns): its events come from where it was a latency ago."""
+        x, y = self.position_at(t_ns)
+        late_s = self._late_s()
+        return x + self.vx_px_per_s * late_s, y + self.vy_px_per_s * late_s
+
+    def _late_s(self) -> float:
+        """Return how late events are (s): those of a light that switches tell where it is; those of its edges come late."""
+        speed = math.hypot(self.vx_px_per_s, self.vy_px_per_s)
+        return self.latency_s * speed / (speed + _EDGES_PX_PER_S)
+
+    def covariance_at(self, t_ns: int) -> tuple[float, float, float]:
+        """Return the covariance of that (px²): of x, of x and y, of y.
+
+        It is the filter's, what a spot's pixels differ by (in rest the same for all time, in motion averaged out), and
+        the latency's uncertainty along the way.
+        """
+        vx, vy = self.vx_px_per_s, self.vy_px_per_s
+        both = self.variance_at(t_ns) + _GRAIN_PX**2 / (1.0 + math.hypot(vx, vy) / _GRAIN_SPEED_PX_PER_S)
+        along = (_LATENCY_SHARE * self._late_s()) ** 2
+        return both + along * vx * vx, along * vx * vy, both + along * vy * vy
 
     def begin(self, x_px: float, y_px: float, t_ns: int, variance_px2: float, speed_variance: float) -> None:
         """Be at a place at ``t_ns`` (ns), at an unknown velocity."""
@@ -234,8 +262,9 @@ class MotionTracker(Tracker):
     def _make(self, track_id: int, blob: Blob, t_hop_ns: int, tried_ns: int | None) -> Track:
         track = MotionTrack(
             track_id, blob.x_px, blob.y_px, blob.t_ns, blob.extent_px, blob.index, blob.t_ns, blob.t_ns,
-            matched_ns=t_hop_ns, tried_ns=tried_ns, origin_ns=t_hop_ns,
+            matched_ns=t_hop_ns, tried_ns=tried_ns, origin_ns=t_hop_ns, latency_s=self._parameters.event_latency_s,
         )  # fmt: skip
         track.begin(blob.x_px, blob.y_px, blob.t_ns, blob.variance_px2 + 0.05**2, _FIRST_SPEED_PX_PER_S**2)
+        track.row[TRUST] = 1.0
         track.row[USUAL] = blob.fresh_count / self._parameters.hop_s
         return track

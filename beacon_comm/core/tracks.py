@@ -94,6 +94,14 @@ class Track:
         pp, pv, vv = self.variance
         return pp + dt * (2 * pv + dt * (vv + self.noise * dt / 3))
 
+    def light_at(self, t_ns: int) -> tuple[float, float]:
+        """Return the predicted centre of the light (px) at ``t_ns`` (ns): the same as the events'."""
+        return self.position_at(t_ns)
+
+    def covariance_at(self, t_ns: int) -> tuple[float, float, float] | None:
+        """Return the covariance of that (px²): of x, of x and y, of y; None: unknown."""
+        return None
+
     def observe(self, x_px: float, y_px: float, t_ns: int, variance_px2: float) -> None:
         """Take an observation at ``t_ns``; one that is older than the state counts as of the state's time."""
         t_ns = max(t_ns, self.t_ns)
