@@ -41,6 +41,7 @@ def beacon(**changes: object) -> BeaconSnapshot:
         'bit_rate_std_bps': 0.01,
         'confirmed_at_ns': 2**40, 'characters': 20, 'characters_ok': 18, 'parity_errors': 1, 'framing_errors': 1,
         'bearing': np.array([0.0, 0.6, 0.8]), 'azimuth_rad': 0.1, 'elevation_rad': -0.2, 'age_s': 0.03,
+        'pixel_covariance': ((0.01, 0.001), (0.001, 0.02)), 'angle_covariance': ((4e-8, 1e-9), (1e-9, 5e-8)),
     }
     return BeaconSnapshot(**{**values, **changes})  # type: ignore[arg-type]
 
@@ -86,7 +87,15 @@ def test_a_calibrated_beacon_has_a_bearing() -> None:
     assert message.beacons[0].beacon_id == ''
     (bearing,) = conversions.bearings_message(AT, 'camera', [beacon()]).bearings
     assert (bearing.azimuth_rad, bearing.elevation_rad, bearing.age_s) == (0.1, -0.2, 0.03)
-    assert bearing.covariance[0] == -1.0
+    assert bearing.covariance.tolist() == [4e-8, 1e-9, 1e-9, 5e-8]
+    assert message.beacons[0].pixel_covariance.tolist() == pytest.approx([0.01, 0.001, 0.001, 0.02])
+
+
+def test_an_unknown_covariance_says_so() -> None:
+    unknown = beacon(pixel_covariance=None, angle_covariance=None)
+    (bearing,) = conversions.bearings_message(AT, 'camera', [unknown]).bearings
+    (message,) = conversions.beacons_message(AT, 'camera', [unknown], slots_full=False).beacons
+    assert bearing.covariance[0] == message.pixel_covariance[0] == -1.0
 
 
 def test_an_uncalibrated_beacon_says_so() -> None:

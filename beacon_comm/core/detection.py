@@ -141,6 +141,10 @@ class Detector:
             lost += changes.lost
         return TrackChanges(tuple(new), tuple(lost), waiting=self._stats.waiting_blobs)
 
+    def disown(self, track_id: int) -> None:
+        """Let a track go on under a label of its own from the next hop on."""
+        self._tracker.disown(track_id)
+
     def backlog(self, track_id: int) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
         """Return the buffered events of a track: times (ns), ``(n,)`` int64, and ±1, ``(n,)`` int8.
 
@@ -180,18 +184,20 @@ class Detector:
         return changes
 
     def _keep_buffers(self, blobs: list[Blob], changes: TrackChanges, t_hop_ns: int) -> None:
+        for old, new in changes.renamed:
+            self._buffers[new] = self._buffers[old]
         for track in changes.lost:
             del self._buffers[track.track_id]
-        if changes.new:
+        if changes.new_blobs:
             self._begin_buffers(blobs, changes)
         for buffer in self._buffers.values():
             self._stats.buffer_overflow_events += buffer.trim(t_hop_ns)
 
     def _begin_buffers(self, blobs: list[Blob], changes: TrackChanges) -> None:
         """Begin each new track's buffer with the events on its blob's pixels that are in the blob's window."""
-        for track in changes.new:
+        begun = dict(zip(changes.new_blobs, changes.new, strict=False))  # behind them: the renamed ones
+        for track in begun.values():
             self._buffers[track.track_id] = EventBuffer(self._buffer_ns, self._parameters.buffer_max_bytes)
-        begun = dict(zip(changes.new_blobs, changes.new, strict=True))
         for w, window in enumerate(self._images.windows):
             wanted = np.zeros(len(blobs) + 1, np.bool_)
             wanted[[b + 1 for b in begun if blobs[b].window == w]] = True

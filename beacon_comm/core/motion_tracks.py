@@ -3,17 +3,20 @@
     at a hop    own events, as many as usual       ──► seen, wherever the blobs are
                 a blob of its own                  ──► seen; where its own events were fewer: there it is
                 neither                            ──► quiet: predicted, and what comes within its circle moves it again
-                a fresh blob of no track           ──► a new track
+                a fresh blob of no track           ──► a new track; near where one was lost within ``reacquire_s``: that one's label
 
 The paper's index of a track is that of a pixel moved along: its events over its area in windows that forget like the
 detection's short and long one, so that a fast one has an index, too.
+
+A label comes back only to what is where the lost track may be; when its bit rate is known and is another one, it goes on
+under a label of its own (:meth:`MotionTracker.disown`).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +30,7 @@ from beacon_comm.core.motion import (
     EXTENT, HIDDEN, HOP_OFF, HOP_ON, HOP_RR, LAST, LONG_OFF, LONG_ON, NOISE, SHORT_OFF, SHORT_ON, TRUST, USUAL, T, X,
 )  # fmt: skip
 from beacon_comm.core.parameters import Parameters
-from beacon_comm.core.tracks import Track, TrackChanges, Tracker, positions_at
+from beacon_comm.core.tracks import Covariance, Track, TrackChanges, Tracker, positions_at
 
 _FEWEST_EVENTS = 4
 _SEEN_SHARE = 0.1  # of the usual events of a hop: fewer are the background's
@@ -86,8 +89,8 @@ class MotionTrack(Track):
         speed = math.hypot(self.vx_px_per_s, self.vy_px_per_s)
         return self.latency_s * speed / (speed + _EDGES_PX_PER_S)
 
-    def covariance_at(self, t_ns: int) -> tuple[float, float, float]:
-        """Return the covariance of that (px²): of x, of x and y, of y.
+    def covariance_at(self, t_ns: int) -> Covariance:
+        """Return the covariance of that (px²).
 
         It is the filter's, what a spot's pixels differ by (in rest the same for all time, in motion averaged out), and
         the latency's uncertainty along the way.
@@ -95,7 +98,8 @@ class MotionTrack(Track):
         vx, vy = self.vx_px_per_s, self.vy_px_per_s
         both = self.variance_at(t_ns) + _GRAIN_PX**2 / (1.0 + math.hypot(vx, vy) / _GRAIN_SPEED_PX_PER_S)
         along = (_LATENCY_SHARE * self._late_s()) ** 2
-        return both + along * vx * vx, along * vx * vy, both + along * vy * vy
+        cross = along * vx * vy
+        return (both + along * vx * vx, cross), (cross, both + along * vy * vy)
 
     def begin(self, x_px: float, y_px: float, t_ns: int, variance_px2: float, speed_variance: float) -> None:
         """Be at a place at ``t_ns`` (ns), at an unknown velocity."""
@@ -132,6 +136,9 @@ class MotionTracker(Tracker):
         short = whole_hops(parameters.short_window_s, parameters.hop_s)
         long = whole_hops(parameters.long_window_bits * parameters.slowest_bit_s, parameters.hop_s)
         self._forget = np.array([1.0 - 1.0 / short] * 2 + [1.0 - 1.0 / max(short, long)] * 2)
+        self._reacquire_ns = round(parameters.reacquire_s * NS_PER_S)
+        self._remembered: dict[int, MotionTrack] = {}
+        self._disowned: list[int] = []
         self._least_index = parameters.index_threshold * parameters.index_grow_share
 
     def update(self, blobs: Sequence[Blob], t_hop_ns: int) -> TrackChanges:
@@ -160,8 +167,69 @@ class MotionTracker(Tracker):
         lost = tuple(track for track in tracks if self._ended(track, t_hop_ns))
         for track in lost:
             del self._tracks[track.track_id]
+        self._remember(lost, t_hop_ns)
         left = self._unfollowed(tracks, blobs, track_of, t_hop_ns)
-        return self._begin(left, blobs, lost, t_hop_ns)
+        return self._rename(self._begin(left, blobs, lost, t_hop_ns))
+
+    def clear(self, sensor_size: tuple[int, int]) -> TrackChanges:
+        """Lose every track and go on with a sensor size; labels go on."""
+        self._remembered.clear()
+        self._disowned.clear()
+        return super().clear(sensor_size)
+
+    def disown(self, track_id: int) -> None:
+        """Let what has taken a lost track's label, and sends at another rate, go on under a label of its own."""
+        self._disowned.append(track_id)
+
+    def _rename(self, changes: TrackChanges) -> TrackChanges:
+        """Give the disowned tracks labels of their own."""
+        old, new = [], []
+        for track_id in self._disowned:
+            track = self._tracks.pop(track_id, None)
+            if track is not None:
+                old.append(track)
+                new.append(replace(track, track_id=self._next_id, claimed_bps=None, held=False, tried_ns=None))
+                self._tracks[self._next_id] = new[-1]
+                self._next_id += 1
+        self._disowned.clear()
+        if not old:
+            return changes
+        renamed = tuple((a.track_id, b.track_id) for a, b in zip(old, new, strict=True))
+        return replace(changes, new=changes.new + tuple(new), lost=changes.lost + tuple(old), renamed=renamed)
+
+    def _remember(self, lost: Sequence[Track], t_hop_ns: int) -> None:
+        """Remember the tracks that were lost out of sight and whose rate is known, for ``reacquire_s``."""
+        for track_id, track in list(self._remembered.items()):
+            if t_hop_ns - track.last_seen_ns >= self._reacquire_ns:
+                del self._remembered[track_id]
+        for track in lost:
+            rate_bps = track.bit_rate_bps if track.claimed_bps is None else track.claimed_bps
+            if isinstance(track, MotionTrack) and rate_bps is not None and track.covered_since_ns is None:
+                self._remembered[track.track_id] = replace(track, bit_rate_bps=rate_bps, row=track.row.copy())
+
+    def _new_track(self, blob: Blob, t_hop_ns: int, tried_ns: int) -> Track:
+        old = self._recognised(blob, t_hop_ns)
+        if old is None:
+            return super()._new_track(blob, t_hop_ns, tried_ns)
+        del self._remembered[old.track_id]
+        track = self._make(old.track_id, blob, t_hop_ns, None)
+        track.claimed_bps = old.bit_rate_bps
+        self._tracks[track.track_id] = track
+        for track_id in sorted(self._tracks):  # oldest first again
+            self._tracks[track_id] = self._tracks.pop(track_id)
+        return track
+
+    def _recognised(self, blob: Blob, t_hop_ns: int) -> MotionTrack | None:
+        """Return the remembered track that a blob is likeliest to be, within the gates."""
+        p = self._parameters
+        best, least = None, math.inf
+        for track in self._remembered.values():
+            x, y = track.position_at(blob.t_ns)
+            distance = math.hypot(blob.x_px - x, blob.y_px - y)
+            deviation = math.sqrt(track.variance_at(blob.t_ns))
+            if distance <= min(p.max_gate_px, p.association_gate_px + 3.0 * deviation) and distance / (1.0 + deviation) < least:
+                best, least = track, distance / (1.0 + deviation)
+        return best if best is not None and t_hop_ns - best.last_seen_ns < self._reacquire_ns else None
 
     def _evidence(self, rows: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Return each track's events of the hop, its index and the spread of the events as an extent (px)."""

@@ -30,7 +30,9 @@ from beacon_comm.core.index_image import hop_length_ns
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.routing import Routed
 from beacon_comm.core.signal_detection import WholeSignal
-from beacon_comm.core.tracks import Track, TrackChanges
+from beacon_comm.core.tracks import Covariance, Track, TrackChanges
+
+_SAME_RATE = 0.02  # the same beacon's rates differ by less
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +40,7 @@ class BeaconSnapshot:
     """One track at one instant, from its first sight on.
 
     Attributes:
-        track_id: label, never given twice by one receiver.
+        track_id: label, never given twice by one receiver, but to what is taken for the one that was lost (``reacquire_s``).
         state: candidate (waiting, demodulating, demoted), confirmed or lost.
         quiet: no events in the last window; the position is predicted.
         t_ns: instant of the prediction (ns, sensor clock).
@@ -52,6 +54,8 @@ class BeaconSnapshot:
         characters, characters_ok, parity_errors, framing_errors: counted since the slot was given.
         bearing: unit vector in the optical frame, ``(3,)`` float64, None without calibration.
         azimuth_rad, elevation_rad: see :func:`beacon_comm.core.bearing.azimuth_elevation`; None without calibration.
+        pixel_covariance: of the centre (px²), ((xx, xy), (xy, yy)); None: unknown.
+        angle_covariance: of azimuth and elevation (rad²), likewise; None: unknown, no calibration, or not confirmed.
         age_s: time since the last observation (s).
     """
 
@@ -75,6 +79,8 @@ class BeaconSnapshot:
     bearing: NDArray[np.float64] | None
     azimuth_rad: float | None
     elevation_rad: float | None
+    pixel_covariance: Covariance | None
+    angle_covariance: Covariance | None
     age_s: float
 
 
@@ -104,6 +110,7 @@ class Detection(Protocol):
     def route(self, segment: EventBatch) -> list[Routed]: ...
     def hop(self, t_hop_ns: int) -> TrackChanges: ...
     def backlog(self, track_id: int) -> tuple[NDArray[np.int64], NDArray[np.int8]]: ...
+    def disown(self, track_id: int) -> None: ...
     def resize(self, sensor_size: tuple[int, int]) -> TrackChanges: ...
     def reset(self) -> TrackChanges: ...
 
@@ -148,6 +155,7 @@ class Receiver:
                 changes = self._detection.hop(segment.t_end_ns)
                 self._lose(changes, characters, lost)
                 characters += self._slots.assign(self._detection.tracks, segment.t_end_ns, self._detection.backlog)
+                self._compare_rates()
         return self._output(characters, lost)
 
     def flush(self) -> Output:
@@ -208,6 +216,19 @@ class Receiver:
         self._t_ns = batch.t_end_ns
         yield batch.slice(start, len(batch), batch.t_end_ns), False
 
+    def _compare_rates(self) -> None:
+        """Tell the tracks their bit rates; take the label from one that has it of a lost one with another rate."""
+        for track_id, track in self._detection.tracks.items():
+            rate_bps = self._slots.bit_rate_bps(track_id)
+            if rate_bps is None:
+                continue
+            track.bit_rate_bps = rate_bps
+            if track.claimed_bps is not None:
+                if abs(rate_bps / track.claimed_bps - 1.0) > _SAME_RATE:
+                    self._detection.disown(track_id)
+                else:
+                    track.claimed_bps = None
+
     def _lose(
         self, changes: TrackChanges, characters: list[ReceivedCharacter], lost: list[BeaconSnapshot]
     ) -> None:
@@ -229,12 +250,16 @@ class Receiver:
         return Output(tuple(characters), tuple(lost), changed)
 
     def _snapshot(self, track: Track, t_ns: int, state: BeaconState | None = None) -> BeaconSnapshot:
-        x_px, y_px = track.position_at(t_ns)
+        x_px, y_px = track.light_at(t_ns)
+        pixel = track.covariance_at(t_ns)
         record = self._slots.record(track.track_id)
-        bearing = azimuth = elevation = None
+        bearing = azimuth = elevation = angle = None
         if self._camera is not None:
             bearing = self._camera.bearings(np.array([[x_px, y_px]]))[0]
-            azimuth, elevation = (float(angle) for angle in azimuth_elevation(bearing))
+            azimuth, elevation = azimuth_elevation(bearing)
+            if pixel is not None and self._slots.state(track.track_id) is BeaconState.CONFIRMED:
+                (aa, ab), (_, bb) = self._camera.angle_covariance((x_px, y_px), pixel).tolist()
+                angle = (aa, ab), (ab, bb)
         return BeaconSnapshot(
             track_id=track.track_id,
             state=self._slots.state(track.track_id) if state is None else state,
@@ -256,6 +281,8 @@ class Receiver:
             bearing=bearing,
             azimuth_rad=azimuth,
             elevation_rad=elevation,
+            pixel_covariance=pixel,
+            angle_covariance=angle,
             age_s=max(0, t_ns - track.last_seen_ns) / NS_PER_S,
         )
 

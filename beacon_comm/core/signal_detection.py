@@ -67,6 +67,9 @@ class WholeSignal:
         self._tracks[track.track_id] = track
         return TrackChanges(new=(track,))
 
+    def disown(self, track_id: int) -> None:
+        """Do nothing: a lost signal's label never comes back."""
+
     def backlog(self, track_id: int) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
         """Return the buffered events: times (ns), ``(n,)`` int64, and ±1, ``(n,)`` int8."""
         return self._buffer.events()

@@ -40,6 +40,8 @@ _KNOWN_AFTER_NS = 100_000_000  # a velocity seen for less long is not gone on wi
 _FLOOR_PX = 0.05  # an observation is never better than this
 _SURPRISE = 16.0  # an innovation of more than 4 standard deviations is a manoeuvre
 _NEVER = -(1 << 63)
+Covariance = tuple[tuple[float, float], tuple[float, float]]
+"""((xx, xy), (xy, yy))."""
 _EXTENT_RISE, _EXTENT_FALL = 0.5, 0.05  # an extent grows at once and shrinks slowly
 
 
@@ -61,6 +63,8 @@ class Track:
         tried_ns: when (ns) its last turn at a demodulator ended, or that of the track that made room there; None: there was
             none, or it has it now.
         covered_since_ns: since when (ns) an older track has had the blob it lies in, None: it lies in none.
+        bit_rate_bps: the last settled bit rate (bit/s), None: never one.
+        claimed_bps: the bit rate (bit/s) of the lost track whose label it has taken, as long as its own is not known.
         variance: of position (px²), of position and velocity (px²/s), of velocity (px²/s²), one axis.
         noise: white acceleration (px²/s³) that the variance grows by.
     """
@@ -80,6 +84,8 @@ class Track:
     held: bool = False
     tried_ns: int | None = None
     covered_since_ns: int | None = None
+    bit_rate_bps: float | None = None
+    claimed_bps: float | None = None
     variance: tuple[float, float, float] = field(default=(1.0, 0.0, _FIRST_SPEED_PX_PER_S**2))
     noise: float = _ACCELERATION
 
@@ -98,8 +104,8 @@ class Track:
         """Return the predicted centre of the light (px) at ``t_ns`` (ns): the same as the events'."""
         return self.position_at(t_ns)
 
-    def covariance_at(self, t_ns: int) -> tuple[float, float, float] | None:
-        """Return the covariance of that (px²): of x, of x and y, of y; None: unknown."""
+    def covariance_at(self, t_ns: int) -> Covariance | None:
+        """Return the covariance of that (px²); None: unknown."""
         return None
 
     def observe(self, x_px: float, y_px: float, t_ns: int, variance_px2: float) -> None:
@@ -151,12 +157,14 @@ class TrackChanges:
         lost: tracks that ended, unseen for too long, merged or in favour of others, as they were.
         new_blobs: for each new track, which of the hop's blobs it began with.
         waiting: blobs that got no track because ``max_tracks`` are kept.
+        renamed: new tracks that go on with another's events under a label of their own: that one's label, their own.
     """
 
     new: tuple[Track, ...] = ()
     lost: tuple[Track, ...] = ()
     new_blobs: tuple[int, ...] = ()
     waiting: int = 0
+    renamed: tuple[tuple[int, int], ...] = ()
 
 
 class Tracker:
@@ -210,6 +218,9 @@ class Tracker:
         room = max(0, self._parameters.max_tracks - len(self._tracks))
         new = tuple(self._new_track(blobs[j], t_hop_ns, tried_ns) for tried_ns, j in left[:room])
         return TrackChanges(new, lost + evicted, tuple(j for _, j in left[:room]), len(left) - len(new))
+
+    def disown(self, track_id: int) -> None:
+        """Take a label from a track that is not what it was given it for."""
 
     def clear(self, sensor_size: tuple[int, int]) -> TrackChanges:
         """Lose every track and go on with a sensor size; labels go on."""

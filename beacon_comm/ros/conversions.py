@@ -15,6 +15,7 @@ from std_msgs.msg import Header
 
 from beacon_comm.core.candidates import BeaconState
 from beacon_comm.core.receiver import BeaconSnapshot
+from beacon_comm.core.tracks import Covariance
 from beacon_comm.msg import Beacon, Beacons, Bearing, Bearings, Character, Characters, Confirmed, Text
 from beacon_comm.ros.stamped import Instant, StampedCharacter
 from beacon_comm.ros.text import BeaconText, printable
@@ -107,7 +108,12 @@ def _beacon_message(beacon: BeaconSnapshot) -> Beacon:
         framing_errors=beacon.framing_errors,
         has_bearing=beacon.bearing is not None,
         bearing=vector_message(beacon.bearing),
+        pixel_covariance=[_float32(entry) for entry in _covariance_message(beacon.pixel_covariance)],
     )
+
+
+def _covariance_message(covariance: Covariance | None) -> tuple[float, ...]:
+    return UNKNOWN_COVARIANCE if covariance is None else (*covariance[0], *covariance[1])
 
 
 def bearings_message(at: Instant, frame_id: str, beacons: Sequence[BeaconSnapshot]) -> Bearings:
@@ -130,7 +136,7 @@ def _bearing_message(beacon: BeaconSnapshot) -> Bearing:
         azimuth_rad=NAN if beacon.azimuth_rad is None else float(beacon.azimuth_rad),
         elevation_rad=NAN if beacon.elevation_rad is None else float(beacon.elevation_rad),
         age_s=float(beacon.age_s),
-        covariance=UNKNOWN_COVARIANCE,
+        covariance=_covariance_message(beacon.angle_covariance),
     )
 
 
