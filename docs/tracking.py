@@ -241,7 +241,8 @@ def crossings(full: bool, runs: int | None = None) -> dict[str, Any]:
         for near in (False, True):
             seeds = range(runs if tracker == 'motion' else max(runs // 5, 5))
             ends = [cross(seed, near, tracker) for seed in tqdm(seeds, desc=f'crossings, {tracker}')]
-            found[f'{"3 radii" if near else "20 radii"} {tracker}'] = {end: ends.count(end) for end in ('kept', 'swapped', 'lost')}
+            counts = {end: ends.count(end) for end in ('kept', 'swapped', 'lost')}
+            found[f'{"3 radii" if near else "20 radii"} {tracker}'] = counts
     return found
 
 
@@ -292,7 +293,8 @@ def hidden(full: bool) -> dict[str, Any]:
                         waits.append(k)
                         break
             found[f'{length_s * 1e3:.0f} ms, {speed:.0f} px/s'] = {
-                'same label': kept, 'runs': len(seeds), 'characters missed, most': max(waits, default=-1), 're-locked': len(waits),
+                'runs': len(seeds), 'same label': kept, 're-locked': len(waits),
+                'characters missed, most': max(waits, default=-1),
             }  # fmt: skip
     return found
 
@@ -313,9 +315,30 @@ def shaken(full: bool) -> dict[str, Any]:
             receiver, received, truth = receive(simulate(make_description(content), seed=mev), index_threshold=threshold)
             one = score(received, truth.beacons[0], 0.8, duration_s - 0.1)
             found[f'{mev} Mev/s, index_threshold {threshold:g}'] = [one.right, one.sent, len(receiver.beacons())]
-            if full is False and mev >= 10:
-                continue
     return found
+
+
+def looked_at(simulated: Simulated, kind: str) -> np.ndarray:
+    """Return errors (px), normalised error squared and trace of the covariance (px²) of the track of one beacon, ``(n, 4)``."""
+    rows: list[list[float]] = []
+    (beacon,) = simulated[1].beacons
+    out_s = turns_s(beacon, 1.3) if kind == 'line' else np.empty(0)
+
+    def look(detector: Detector, truth: SceneTruth, t_hop_ns: int) -> None:
+        for t_ns in (t_hop_ns, t_hop_ns + 4_000_000):
+            t_s = t_ns / NS_PER_S
+            if t_s < BEGIN_S or np.any((t_s > out_s) & (t_s < out_s + 0.02)):
+                continue
+            track, distance = nearest(detector, beacon, t_ns)
+            if track is None or distance > 5 * RADIUS_PX:
+                rows.append([math.nan] * 4)
+                continue
+            error = np.subtract(track.light_at(t_ns), [float(value) for value in beacon.centre(t_ns)])
+            covariance = np.array(track.covariance_at(t_ns))
+            rows.append([*error, float(error @ np.linalg.solve(covariance, error)), float(np.trace(covariance))])
+
+    follow(simulated, look)
+    return np.array(rows)
 
 
 def errors(full: bool) -> dict[str, Any]:
@@ -325,28 +348,8 @@ def errors(full: bool) -> dict[str, Any]:
         ('still', 'still', 0.0), ('line, 300 px/s', 'line', 300.0), ('line, 1000 px/s', 'line', 1000.0),
         ('line, 2000 px/s', 'line', 2000.0), ('circle, 1000 px/s', 'circle', 1000.0),
     ):  # fmt: skip
-        rows: list[list[float]] = []
-        for seed in tqdm(range(40 if full else 8), desc=name):
-            out_s = np.empty(0)
-
-            def look(detector: Detector, truth: SceneTruth, t_hop_ns: int) -> None:
-                nonlocal out_s
-                if len(out_s) == 0:
-                    out_s = turns_s(truth.beacons[0], 1.3) if kind == 'line' else np.array([-1.0])
-                for t_ns in (t_hop_ns, t_hop_ns + 4_000_000):
-                    t_s = t_ns / NS_PER_S
-                    if t_s < BEGIN_S or np.any((t_s > out_s) & (t_s < out_s + 0.02)):
-                        continue
-                    track, distance = nearest(detector, truth.beacons[0], t_ns)
-                    if track is None or distance > 5 * RADIUS_PX:
-                        rows.append([math.nan] * 4)
-                        continue
-                    error = np.subtract(track.light_at(t_ns), [float(value) for value in truth.beacons[0].centre(t_ns)])
-                    covariance = np.array(track.covariance_at(t_ns))
-                    rows.append([*error, float(error @ np.linalg.solve(covariance, error)), float(np.trace(covariance))])
-
-            follow(scene([moving(kind, speed, seed)], 1.3, 1000 + seed), look)
-        table = np.array(rows)
+        seeds = tqdm(range(40 if full else 8), desc=name)
+        table = np.concatenate([looked_at(scene([moving(kind, speed, seed)], 1.3, 1000 + seed), kind) for seed in seeds])
         lost = float(np.isnan(table[:, 0]).mean())
         table = table[~np.isnan(table[:, 0])]
         found[name] = {
@@ -383,7 +386,8 @@ def page(found: dict[str, Any], command: str) -> str:
             continue
         first = next(iter(found[name].values()))
         columns = list(first) if isinstance(first, dict) else ['right', 'sent', 'tracks at the end']
-        rows = [[key, *(_shown(v) for v in (value.values() if isinstance(value, dict) else value))] for key, value in found[name].items()]
+        values = {key: value.values() if isinstance(value, dict) else value for key, value in found[name].items()}
+        rows = [[key, *(_shown(entry) for entry in entries)] for key, entries in values.items()]
         parts.append(f'## {title}\n\n{text}')
         parts.append(table(['', *columns], rows))
     return '\n'.join(parts)
@@ -396,17 +400,18 @@ def _shown(value: Any) -> str:
 HEAD = """# Tracking
 
 Written by `COMMAND` on simulated scenes ([docs/simulator.md](simulator.md)): 640 × 480, beacons of 1 kbps, default parameters
-with the bit rate listed. `motion` is the default tracker, `nearest` the paper's ([following.py](../beacon_comm/core/following.py),
-[motion.py](../beacon_comm/core/motion.py), [motion_tracks.py](../beacon_comm/core/motion_tracks.py)).
+with the bit rate listed. `motion` is the default tracker ([following.py](../beacon_comm/core/following.py),
+[motion.py](../beacon_comm/core/motion.py), [motion_tracks.py](../beacon_comm/core/motion_tracks.py)), `nearest` the paper's.
 """
 SPEEDS = """Slow until locked, then ramped up to the speed; a straight line that turns back at the borders, scored from 10 ms
 after each turn, and a circle of 200 px radius. In parentheses: 95 % intervals (Wilson).
 """
 SECTIONS = (
     ('crossings', 'Two beacons that pass one another',
-     'At 500 px/s relative to one another, past one another by 0 to 3 radii, from 20 radii apart, or after standing 3 radii apart.\n'),
+     'At 500 px/s relative to one another, past one another by 0 to 3 radii, from 20 radii apart, or after standing 3 radii\n'
+     'apart.\n'),
     ('many', 'Beacons at once', 'On a grid, the camera shaken by 5 px; shares of characters right.\n'),
-    ('hidden', 'Hidden for a moment', 'Characters missed: complete ones sent after it is back, before three in a row are right.\n'),
+    ('hidden', 'Hidden for a moment', 'Characters missed: sent after it is back, before three in a row are right.\n'),
     ('shaken', 'A camera shaken over texture', 'On 1280 × 720; `index_threshold` at its default and raised.\n'),
     ('errors', 'Pixel error and covariance',
      'In two dimensions, at hops and 4 ms behind them; from 0.8 s on, but for 20 ms from each turn at a border on.\n'),
@@ -428,9 +433,10 @@ def draw(found: dict[str, Any], path: Path) -> None:
             share = np.array([v[0] / max(v[1], 1) for _, v in points])
             bounds = np.array([wilson(v[0], v[1]) for _, v in points]).clip(0, 1)
             below, above = np.maximum(share - bounds[:, 0], 0), np.maximum(bounds[:, 1] - share, 0)
-            axis.errorbar(speed, 100 * share, 100 * np.stack((below, above)), marker='o', capsize=3, color=colour, label=tracker)
+            bars = 100 * np.stack((below, above))
+            axis.errorbar(speed, 100 * share, bars, marker='o', capsize=3, color=colour, label=tracker)
         axis.axhline(99, color='grey', linewidth=0.8, linestyle=':')
-        axis.set(xscale='log', xlabel='image speed (px/s)', title={'line': 'line, bouncing', 'circle': 'circle, radius 200 px'}[kind])
+        axis.set(xscale='log', xlabel='image speed (px/s)', title=kind)
         axis.grid(alpha=0.3)
     axes[0].set_ylabel('characters right (%)')
     axes[0].legend(title='tracker')
@@ -444,7 +450,7 @@ def main() -> int:
     parser.add_argument('--full', action='store_true', help='as many characters and runs as issue 4 asks for')
     parser.add_argument('--only', choices=list(PARTS), action='append', help='only this part (may be given again)')
     parser.add_argument('--runs', type=int, help='crossings: so many')
-    parser.add_argument('--write', action='store_true', help='write docs/tracking.md, .json and the figure; parts not measured stay')
+    parser.add_argument('--write', action='store_true', help='write tracking.md, .json, the figure; other parts stay')
     options = parser.parse_args()
     stored = DOCS / 'tracking.json'
     found: dict[str, Any] = json.loads(stored.read_text()) if options.write and stored.exists() else {}

@@ -46,7 +46,7 @@ def test_uniform_motion_is_foreseen_as_well_as_it_says(speed: float) -> None:
 def test_something_that_turns_back_is_followed_within_milliseconds(speed: float) -> None:
     times = np.arange(1, 300) * 5e-4
     found = follow(row(speed_variance=speed**2), lambda t: np.array([speed * (0.1 - abs(t - 0.1)), 0.0]), times, 0.3)
-    after = [error for t_s, (error, _, _) in zip(times, found, strict=True) if 0.104 < t_s]
+    after = [error for t_s, (error, _, _) in zip(times, found, strict=True) if t_s > 0.104]
     assert max(after) < 2.0
 
 

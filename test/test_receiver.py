@@ -133,21 +133,26 @@ def test_the_last_character_before_a_silence_comes_out_by_time_alone() -> None:
     assert text_of(outputs) == 'Hello, world'
 
 
-def test_a_silent_track_is_quiet_then_lost_and_its_label_is_not_given_again() -> None:
-    receiver = Receiver(Parameters(lost_after_s=0.5), SIZE)
+@pytest.mark.parametrize(('reacquire_s', 'rate_bps', 'label'), [(0.0, 3125.0, 2), (10.0, 3125.0, 1), (10.0, 2000.0, 2)])
+def test_a_silent_track_is_quiet_then_lost_and_its_label_comes_back_with_its_rate_alone(
+    reacquire_s: float, rate_bps: float, label: int
+) -> None:
+    receiver = Receiver(Parameters(lost_after_s=0.5, reacquire_s=reacquire_s), SIZE)
     beacon = on_disc(simulate_text(TEXT, 3125.0, t0_ns=0, lead_s=0.0, tail_s=0.0, seed=6), still(40, 30))
     receiver.push(beacon)
     end_ns = int(beacon.t_ns[-1])
     (first,) = receiver.beacons()
-    assert not first.quiet
+    assert first.track_id == 1 and not first.quiet
     assert receiver.push(EventBatch.empty(end_ns + 200_000_000)).lost == ()
     (still_there,) = receiver.beacons()
     assert still_there.quiet and still_there.age_s == pytest.approx(0.2, abs=0.02)
     (gone,) = receiver.push(EventBatch.empty(end_ns + 700_000_000)).lost
     assert (gone.track_id, gone.state) == (first.track_id, BeaconState.LOST)
-    receiver.push(shifted(beacon, NS_PER_S))
+    back = on_disc(simulate_text(TEXT * 2, rate_bps, t0_ns=NS_PER_S, lead_s=0.0, tail_s=0.0, seed=7), still(40, 30))
+    outputs = [receiver.push(back)]
     (again,) = receiver.beacons()
-    assert again.track_id > first.track_id
+    assert again.track_id == label and again.state is BeaconState.CONFIRMED
+    assert [one.track_id for output in outputs for one in output.lost] == ([1] if rate_bps == 2000.0 else [])
 
 
 def test_an_hour_of_nothing_is_one_step() -> None:

@@ -37,10 +37,32 @@ from beacon_comm.core import motion
 from beacon_comm.core.events import NS_PER_S, EventBatch
 from beacon_comm.core.hop_events import ROUTED, HopEvents
 from beacon_comm.core.motion import (
-    EXTENT, HIDDEN, HOP_OFF, HOP_ON, HOP_RR, LAST, LEAD2, LONG_OFF, LONG_ON, N_OFF, N_ON, SINCE, SUM_RR, TRUST, USUAL, VX, VY, T, X, Y, fading_s, observe, variance_at,
+    EXTENT,
+    HIDDEN,
+    HOP_OFF,
+    HOP_ON,
+    HOP_RR,
+    LAST,
+    LEAD2,
+    LONG_OFF,
+    LONG_ON,
+    N_OFF,
+    N_ON,
+    SINCE,
+    SUM_RR,
+    TRUST,
+    USUAL,
+    VX,
+    VY,
+    T,
+    X,
+    Y,
+    fading_s,
+    observe,
+    variance_at,
 )  # fmt: skip
 from beacon_comm.core.motion_tracks import MotionTrack
-from beacon_comm.core.nearest import cells_along, list_cells
+from beacon_comm.core.nearest import list_cells
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.routing import Router, cell_of
 from beacon_comm.core.tracks import Track
@@ -122,7 +144,7 @@ class FollowingRouter(Router):
     def settle(self) -> None:
         """Tell the tracks what the events since the last hop say about them."""
         for k in np.flatnonzero(self._state[:, HOP_OFF] + self._state[:, HOP_ON]):
-            self._tracks[k].settle()
+            self._tracks[int(k)].settle()
 
 
 @njit(cache=True, nogil=True)

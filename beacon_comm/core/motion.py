@@ -1,9 +1,8 @@
-"""How a track moves: three Kalman filters of constant velocity side by side, an interacting multiple model (IMM).
+"""How a track moves: Kalman filters of constant velocity side by side, an interacting multiple model (IMM).
 
-    mode            white acceleration    for
-    0  steady            100 px²/s³       a still camera, uniform motion
-    1  turning         2·10⁶ px²/s³       a circle, a shaken camera
-    2  bounce         2·10¹⁰ px²/s³       a velocity that is another one within a millisecond
+    mode          0       1        2        3         4
+    white         10    5·10³    4·10⁵    2·10⁷     2·10¹⁰    acceleration (px²/s³): from uniform motion over turns and
+                                                              a shaken camera to a bounce within a millisecond
 
 Each update mixes the modes by their transition probabilities in the time since the last one, predicts and corrects every
 mode, and weighs them by how well each foresaw the observation (Blom and Bar-Shalom, 1988).  Both axes share one
@@ -14,7 +13,7 @@ it lags behind nothing.  A prediction goes on at constant velocity for a moment 
 
 A state is one row of float64, so that compiled loops work on the rows of all tracks:
 
-    row   [ T | modes 3 × (x y vx vy pp pv vv) | weights 3 | combined x y vx vy pp pv vv q | sums, see SUMS … | extent, … ]
+    row   [ T | modes 5 × (x y vx vy pp pv vv) | weights 5 | combined x y vx vy pp pv vv q | sums, see SUMS … | extent, … ]
 """
 
 from __future__ import annotations
@@ -31,7 +30,15 @@ MODES = 5
 ACCELERATION = np.array([10.0, 5e3, 4e5, 2e7, 2e10])  # white acceleration (px²/s³)
 LASTS_S = np.array([1e9, 0.5, 0.2, 0.1, 2e-3])  # a mode's acceleration goes on for so long
 # Rate of going over from a mode (row) to another (column) (1/s).
-RATE = np.array([[0.0, 0.5, 0.1, 0.02, 0.1], [1.0, 0.0, 1.0, 0.1, 0.1], [0.5, 1.0, 0.0, 1.0, 0.1], [0.5, 0.5, 1.0, 0.0, 1.0], [100.0, 100.0, 200.0, 200.0, 0.0]])
+RATE = np.array(
+    [
+        [0.0, 0.5, 0.1, 0.02, 0.1],
+        [1.0, 0.0, 1.0, 0.1, 0.1],
+        [0.5, 1.0, 0.0, 1.0, 0.1],
+        [0.5, 0.5, 1.0, 0.0, 1.0],
+        [100.0, 100.0, 200.0, 200.0, 0.0],
+    ]
+)
 _LIKELY = 0.02  # less likely modes are no part of a prediction's variance
 FIRST_WEIGHT = np.array([0.4, 0.2, 0.2, 0.1, 0.1])
 
@@ -49,8 +56,8 @@ SUM_RR, SINCE = range(ON_T + 1, ON_T + 3)
 HOP_OFF, HOP_ON, HOP_RR, LAST = range(SINCE + 1, SINCE + 5)
 # ON and OFF events in windows that forget like the short and the long one.
 SHORT_ON, SHORT_OFF, LONG_ON, LONG_OFF = range(LAST + 1, LAST + 5)
-# Radius (px), whether the windows do not get its events, how many events a second are usual, and the square of how
-# far ON events come before the centre and OFF events behind it (px²), and the variance of its observations over what independent events have.
+# Radius (px); whether the windows do not get its events; how many events a second are usual; the square of how far ON events
+# come before the centre and OFF events behind it (px²); the variance of observations over what independent events have.
 EXTENT, HIDDEN, USUAL, LEAD2, TRUST = range(LONG_OFF + 1, LONG_OFF + 6)
 WIDTH = TRUST + 1
 

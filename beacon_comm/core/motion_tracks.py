@@ -3,7 +3,7 @@
     at a hop    own events, as many as usual       ──► seen, wherever the blobs are
                 a blob of its own                  ──► seen; where its own events were fewer: there it is
                 neither                            ──► quiet: predicted, and what comes within its circle moves it again
-                a fresh blob of no track           ──► a new track; near where one was lost within ``reacquire_s``: that one's label
+                a fresh blob of no track           ──► a new track, or one that was lost near there (``reacquire_s``)
 
 The paper's index of a track is that of a pixel moved along: its events over its area in windows that forget like the
 detection's short and long one, so that a fast one has an index, too.
@@ -27,7 +27,21 @@ from beacon_comm.core.blobs import Blob
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.index_image import whole_hops
 from beacon_comm.core.motion import (
-    EXTENT, HIDDEN, HOP_OFF, HOP_ON, HOP_RR, LAST, LONG_OFF, LONG_ON, NOISE, SHORT_OFF, SHORT_ON, TRUST, USUAL, T, X,
+    EXTENT,
+    HIDDEN,
+    HOP_OFF,
+    HOP_ON,
+    HOP_RR,
+    LAST,
+    LONG_OFF,
+    LONG_ON,
+    NOISE,
+    SHORT_OFF,
+    SHORT_ON,
+    TRUST,
+    USUAL,
+    T,
+    X,
 )  # fmt: skip
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.tracks import Covariance, Track, TrackChanges, Tracker, positions_at
@@ -202,17 +216,17 @@ class MotionTracker(Tracker):
         for track_id, track in list(self._remembered.items()):
             if t_hop_ns - track.last_seen_ns >= self._reacquire_ns:
                 del self._remembered[track_id]
-        for track in lost:
-            rate_bps = track.bit_rate_bps if track.claimed_bps is None else track.claimed_bps
-            if isinstance(track, MotionTrack) and rate_bps is not None and track.covered_since_ns is None:
-                self._remembered[track.track_id] = replace(track, bit_rate_bps=rate_bps, row=track.row.copy())
+        for one in lost:
+            rate_bps = one.bit_rate_bps if one.claimed_bps is None else one.claimed_bps
+            if isinstance(one, MotionTrack) and rate_bps is not None and one.covered_since_ns is None:
+                self._remembered[one.track_id] = replace(one, bit_rate_bps=rate_bps, row=one.row.copy())
 
     def _new_track(self, blob: Blob, t_hop_ns: int, tried_ns: int) -> Track:
         old = self._recognised(blob, t_hop_ns)
         if old is None:
             return super()._new_track(blob, t_hop_ns, tried_ns)
         del self._remembered[old.track_id]
-        track = self._make(old.track_id, blob, t_hop_ns, None)
+        track: Track = self._make(old.track_id, blob, t_hop_ns, None)
         track.claimed_bps = old.bit_rate_bps
         self._tracks[track.track_id] = track
         for track_id in sorted(self._tracks):  # oldest first again

@@ -214,8 +214,11 @@ class Parameters(Declared):
     max_gate_px: float = parameter(40.0, 'largest gate', 'px', 0.1)
     lost_after_s: float = parameter(2.0, 'a track unseen for this long is lost', 's', 0.01)
     reacquire_s: float = parameter(
-        10.0, 'motion: what appears so soon where a track of known rate was lost takes its label, unless its rate differs (0: never)',
-        's', 0.0, 3600.0,
+        10.0,
+        'motion: what appears so soon where a track of known rate was lost takes its label, unless its rate is another',
+        's',
+        0.0,
+        3600.0,
     )
     merge_after_s: float = parameter(
         0.5, 'a track inside the blob of an older one for this long is dropped', 's', 0.0
