@@ -46,7 +46,7 @@ SLACK = 0.3
 TEXTS = ("Shall I compare thee to a summer's day? ", 'And summers lease hath all too short a date: ')
 SLOW, HOLD_S, RAMP_END_S = 80.0, 0.3, 0.6
 BEGIN_S = 0.8
-RADIUS_PX = 4.0
+RADIUS_PX = 5.1
 TRACKERS = ('nearest', 'motion')
 Simulated = tuple[Iterator[EventBatch], SceneTruth]
 
@@ -276,8 +276,9 @@ def hidden(full: bool) -> dict[str, Any]:
             seeds = range(20 if full else 4)
             for seed in tqdm(seeds, desc=f'hidden for {length_s * 1e3:.0f} ms'):
                 begin_s, duration_s = 1.2, 2.0
+                place = {'from_px': [60, 60 + 10 * seed]} if speed else {}  # it turns back at no border while it is hidden
                 beacon = {
-                    'bit_rate_bps': BIT_RATE, 'text': TEXTS[0], 'path': moving('line', speed, seed),
+                    'bit_rate_bps': BIT_RATE, 'text': TEXTS[0], 'path': {**moving('line', speed, seed), **place},
                     'occluded_s': [[begin_s, begin_s + length_s]],
                 }  # fmt: skip
                 content = make_description({'duration_s': duration_s, 'beacons': [beacon]})

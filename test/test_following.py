@@ -195,7 +195,7 @@ def test_the_error_is_as_large_as_the_covariance_says() -> None:
 def test_a_moving_light_is_ahead_of_its_events() -> None:
     track = MotionTrack(1, 10.0, 20.0, T0_NS, 4.0, 1.0, T0_NS, T0_NS, 1000.0, 0.0, latency_s=200e-6)
     x, y = track.light_at(T0_NS)
-    assert 10.1 < x < 10.2 and y == 20.0
+    assert x == pytest.approx(10.2) and y == 20.0
     (xx, xy), (yx, yy) = track.covariance_at(T0_NS)
     assert xx > yy and xy == yx == 0.0
 

@@ -70,18 +70,18 @@ from beacon_comm.core.tracks import Track
 STEPS = 10  # of a hop
 UPDATE_EVENTS = 48  # so many events of a track are an observation
 _FEWEST_EVENTS = 4  # at a hop's end so few are one
-_FEWEST_USUAL = 0.2  # less than this share of the usual rate says nothing about the position …
+_FEWEST_USUAL = 0.5  # less than this share of the usual rate is the background's, or one edge of a light that moves …
 _LEAST_SPAN_S = 1e-4  # … be it for so long or longer
 # The variance of observations is learnt from their errors, within bounds: a burst's events are of all pixels alike, which
 # says more than as many at random, and of one moment, which says less.
 _TRUST_GAIN, _MOST_ERROR = 0.03, 5.0
-_LEAST_TRUST, _MOST_TRUST = 0.15, 2.0
+_LEAST_TRUST, _MOST_TRUST = 0.15, 10.0
 _SHARED = 2.0  # events that may be another track's tell so much less
 _EITHER = 12  # so many of either polarity tell how far they are apart
 _LEAD_GAIN = 0.05
 _BALANCE = 0.2  # a share of ON events so much unlike the usual one is a burst of one polarity …
 _SMALL_LEAD = 1.0  # … worth waiting for the other one where it is off by more than this, over the variance, …
-_MOST_EVENTS = 400  # … for no more than so many events …
+_MOST_EVENTS = 4000  # … for no more than so many events …
 _LONGEST_WAIT_S = 4e-3  # … and no longer than this
 _SHORTEST_S = 1e-4  # a burst is read out row by row: its first events are of the upper rows
 _GROWTH_PX = 12.0  # a circle grows by no more than this
@@ -137,7 +137,7 @@ class FollowingRouter(Router):
 
     def close(self) -> HopEvents:
         """Return the events gathered in the hop interval, and begin the next one."""
-        _close(self._state, self._partner)
+        _close(self._state, self._partner, self._hop_ns / NS_PER_S)
         self.settle()
         return super().close()
 
@@ -309,15 +309,19 @@ def _update(row, doubt, at_once):  # type: ignore[no-untyped-def]
         if at_once or n >= 2 * UPDATE_EVENTS or age_s > _LONGEST_WAIT_S:
             row[N_OFF : SINCE + 1] = 0.0
         return False
-    dx, dy, dt = (sums[1] + sums[5]) / n, (sums[2] + sums[6]) / n, (sums[3] + sums[7]) / n
+    usual_on = (row[LONG_ON] + 1.0) / (row[LONG_ON] + row[LONG_OFF] + 2.0)
+    b, a = 0.5 / usual_on, 0.5 / (1.0 - usual_on)  # either polarity counts for as much as the other one, in the long run
+    weight = a * off + b * on
+    dx, dy = (a * sums[1] + b * sums[5]) / weight, (a * sums[2] + b * sums[6]) / weight
+    dt = (a * sums[3] + b * sums[7]) / weight
     spread = 0.5 * max(sums[8] - n * (dx * dx + dy * dy), 0.0)
     spread = max((spread + _PRIOR_EVENTS * 0.25 * row[EXTENT] ** 2) / (n + _PRIOR_EVENTS), _LEAST_SPREAD_PX2)
-    variance = (row[TRUST] if n >= UPDATE_EVENTS else 1.0) * spread / n
+    few = (a * a * off + b * b * on) / (weight * weight)  # 1/n where all count alike
+    variance = (row[TRUST] if n >= UPDATE_EVENTS else 1.0) * spread * few
     if min(off, on) >= _EITHER:
         lead_x, lead_y = 0.5 * (sums[5] / on - sums[1] / off), 0.5 * (sums[6] / on - sums[2] / off)
         lead2 = lead_x * lead_x + lead_y * lead_y - 0.5 * spread * (1.0 / off + 1.0 / on)
         row[LEAD2] += _LEAD_GAIN * (max(lead2, 0.0) - row[LEAD2])
-    usual_on = (row[LONG_ON] + 1.0) / (row[LONG_ON] + row[LONG_OFF] + 2.0)
     more = 2.0 * (on / n - usual_on)
     lead2 = row[LEAD2] * more * more
     if lead2 > _SMALL_LEAD * variance and abs(more) > _BALANCE and n < _MOST_EVENTS and age_s < _LONGEST_WAIT_S and not at_once:
@@ -332,11 +336,11 @@ def _update(row, doubt, at_once):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _close(state, partner):  # type: ignore[no-untyped-def]
-    """Take what is left of the hop's events."""
+def _close(state, partner, hop_s):  # type: ignore[no-untyped-def]
+    """Take what is left of the hop's events of tracks that have few."""
     for k in range(len(state)):
-        if state[k, N_OFF] + state[k, N_ON] >= _FEWEST_EVENTS:
-            _update(state[k], _SHARED if partner[k] >= 0 else 1.0, state[k, LEAD2] == 0.0)
+        if state[k, N_OFF] + state[k, N_ON] >= _FEWEST_EVENTS and state[k, USUAL] * hop_s < 2 * UPDATE_EVENTS:
+            _update(state[k], _SHARED if partner[k] >= 0 else 1.0, True)
 
 
 @njit(cache=True, nogil=True)

@@ -39,6 +39,7 @@ RATE = np.array(
         [100.0, 100.0, 200.0, 200.0, 0.0],
     ]
 )
+_AGAIN_GAIN = 0.01
 _LIKELY = 0.02  # less likely modes are no part of a prediction's variance
 FIRST_WEIGHT = np.array([0.4, 0.2, 0.2, 0.1, 0.1])
 
@@ -46,8 +47,8 @@ FIRST_WEIGHT = np.array([0.4, 0.2, 0.2, 0.1, 0.1])
 T = 0  # time of the state since the hop (s)
 _MODE = 1  # x, y, vx, vy, pp, pv, vv of each mode
 _SIZE = 7
-_WEIGHT = _MODE + MODES * _SIZE
-X, Y, VX, VY, PP, PV, VV, NOISE = range(_WEIGHT + MODES, _WEIGHT + MODES + 8)
+WEIGHT = _MODE + MODES * _SIZE
+X, Y, VX, VY, PP, PV, VV, NOISE = range(WEIGHT + MODES, WEIGHT + MODES + 8)
 # SUMS since the last update, first of the OFF, then of the ON events: number, residuals to the path (px), time (s); …
 N_OFF, OFF_X, OFF_Y, OFF_T, N_ON, ON_X, ON_Y, ON_T = range(NOISE + 1, NOISE + 9)
 # … and of all: squared residual (px²), and the time of the first one (s).
@@ -59,7 +60,9 @@ SHORT_ON, SHORT_OFF, LONG_ON, LONG_OFF = range(LAST + 1, LAST + 5)
 # Radius (px); whether the windows do not get its events; how many events a second are usual; the square of how far ON events
 # come before the centre and OFF events behind it (px²); the variance of observations over what independent events have.
 EXTENT, HIDDEN, USUAL, LEAD2, TRUST = range(LONG_OFF + 1, LONG_OFF + 6)
-WIDTH = TRUST + 1
+# The last observation's error over its standard deviation, and how much of it comes again in the next one.
+ERROR_X, ERROR_Y, AGAIN = range(TRUST + 1, TRUST + 4)
+WIDTH = AGAIN + 1
 
 
 @njit(cache=True, nogil=True)
@@ -78,7 +81,7 @@ def begin(row, t_s, x, y, vx, vy, variance, speed_variance):  # type: ignore[no-
         at = _MODE + j * _SIZE
         row[at], row[at + 1], row[at + 2], row[at + 3] = x, y, vx, vy
         row[at + 4], row[at + 5], row[at + 6] = variance, 0.0, speed_variance
-        row[_WEIGHT + j] = FIRST_WEIGHT[j]
+        row[WEIGHT + j] = FIRST_WEIGHT[j]
     row[N_OFF : SINCE + 1] = 0.0
     _combine(row)
 
@@ -118,7 +121,7 @@ def observe(row, t_s, dx, dy, variance):  # type: ignore[no-untyped-def]
     dt = max(0.0, t_s - row[T])
     s = fading_s(dt)
     zx, zy = row[X] + row[VX] * s + dx, row[Y] + row[VY] * s + dy
-    old = row[_MODE : _WEIGHT + MODES].copy()
+    old = row[_MODE : WEIGHT + MODES].copy()
     stay = np.empty(MODES)
     for i in range(MODES):
         out = 0.0
@@ -126,7 +129,7 @@ def observe(row, t_s, dx, dy, variance):  # type: ignore[no-untyped-def]
             out += RATE[i, j]
         stay[i] = math.exp(-out * dt)
     weight, fit = np.empty(MODES), np.empty(MODES)
-    best, error, part_of, heaviest = -np.inf, 1.0, 0.0, 0.0
+    best, error, part_of, heaviest, error_x, error_y = -np.inf, 1.0, 0.0, 0.0, 0.0, 0.0
     for j in range(MODES):
         total = 0.0
         part = np.empty(MODES)
@@ -135,7 +138,7 @@ def observe(row, t_s, dx, dy, variance):  # type: ignore[no-untyped-def]
             for k in range(MODES):
                 out += RATE[i, k]
             p = stay[i] if i == j else (1.0 - stay[i]) * RATE[i, j] / out
-            part[i] = p * row[_WEIGHT + i]
+            part[i] = p * row[WEIGHT + i]
             total += part[i]
         weight[j] = total
         at = _MODE + j * _SIZE
@@ -163,9 +166,11 @@ def observe(row, t_s, dx, dy, variance):  # type: ignore[no-untyped-def]
         ex, ey = zx - x, zy - y
         fit[j] = -0.5 * (ex * ex + ey * ey) / expected - math.log(expected)
         best = max(best, fit[j])
-        if old[_WEIGHT - _MODE + j] >= heaviest:
-            heaviest = old[_WEIGHT - _MODE + j]
+        if old[WEIGHT - _MODE + j] >= heaviest:
+            heaviest = old[WEIGHT - _MODE + j]
             error, part_of = 0.5 * (ex * ex + ey * ey) / expected, variance / expected
+            scale = 1.0 / math.sqrt(expected * max(error, 1.0))
+            error_x, error_y = ex * scale, ey * scale
         kp, kv = pp / expected, pv / expected
         row[at], row[at + 1] = x + kp * ex, y + kp * ey
         row[at + 2], row[at + 3] = vx + kv * ex, vy + kv * ey
@@ -177,7 +182,9 @@ def observe(row, t_s, dx, dy, variance):  # type: ignore[no-untyped-def]
         weight[j] = max(weight[j] * math.exp(fit[j] - best), 1e-12)
         total += weight[j]
     for j in range(MODES):
-        row[_WEIGHT + j] = weight[j] / total
+        row[WEIGHT + j] = weight[j] / total
+    row[AGAIN] += _AGAIN_GAIN * (0.5 * (error_x * row[ERROR_X] + error_y * row[ERROR_Y]) - row[AGAIN])
+    row[ERROR_X], row[ERROR_Y] = error_x, error_y
     row[T] += dt
     _combine(row)
     return error, part_of
@@ -188,13 +195,13 @@ def _combine(row):  # type: ignore[no-untyped-def]
     """Sum the modes up: mean, variance of an axis with the spread of the means, and white acceleration."""
     row[X : NOISE + 1] = 0.0
     for j in range(MODES):
-        w, at = row[_WEIGHT + j], _MODE + j * _SIZE
+        w, at = row[WEIGHT + j], _MODE + j * _SIZE
         for k in range(4):
             row[X + k] += w * row[at + k]
         if w > _LIKELY:
             row[NOISE] += w * ACCELERATION[j]
     for j in range(MODES):
-        w, at = row[_WEIGHT + j], _MODE + j * _SIZE
+        w, at = row[WEIGHT + j], _MODE + j * _SIZE
         ex, ey, evx, evy = row[at] - row[X], row[at + 1] - row[Y], row[at + 2] - row[VX], row[at + 3] - row[VY]
         row[PP] += w * (row[at + 4] + 0.5 * (ex * ex + ey * ey))
         row[PV] += w * (row[at + 5] + 0.5 * (ex * evx + ey * evy))

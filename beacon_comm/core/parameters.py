@@ -207,7 +207,7 @@ class Parameters(Declared):
         choices=('motion', 'nearest'),
     )
     event_latency_s: float = parameter(
-        200e-6, 'motion: events come so long after the light; a moving beacon is ahead of them', 's', 0.0, 0.01
+        130e-6, 'motion: events come so long after the light; a moving beacon is ahead of them', 's', 0.0, 0.01
     )
     association_gate_px: float = parameter(12.0, 'largest distance of a blob from the predicted centre', 'px', 0.1)
     gate_growth_px_per_s: float = parameter(40.0, 'growth of the gate while a track is unseen', 'px/s', 0.0)
