@@ -27,7 +27,22 @@ from beacon_comm.core.blobs import Blob
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.index_image import whole_hops
 from beacon_comm.core.motion import (
-    AGAIN, EXTENT, HIDDEN, HOP_OFF, HOP_ON, HOP_RR, LAST, LONG_OFF, LONG_ON, NOISE, SHORT_OFF, SHORT_ON, TRUST, USUAL, T, X,
+    AGAIN,
+    EXTENT,
+    HIDDEN,
+    HOP_OFF,
+    HOP_ON,
+    HOP_RR,
+    LAST,
+    LONG_OFF,
+    LONG_ON,
+    NOISE,
+    SHORT_OFF,
+    SHORT_ON,
+    TRUST,
+    USUAL,
+    T,
+    X,
 )  # fmt: skip
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.tracks import Covariance, Track, TrackChanges, Tracker, positions_at
@@ -45,7 +60,7 @@ _SURPRISE = 16.0  # a blob more than 4 standard deviations away: begin anew ther
 _SAME_EXTENTS = 1.1  # two tracks of one blob are half a disc's centroids apart: 0.85 radii
 # What correlated errors make of the variance, calibrated on simulated scenes as the next ones are: errors to the other side
 # cancel for longer than one observation, errors that come again are partly followed.
-_CANCEL, _REPEAT = 4.2, 0.5
+_CANCEL, _REPEAT = 4.2, 0.25
 _LEAST_SHARE = 0.1
 _GRAIN_PX = 0.02  # a spot's centroid is off by so much because its pixels differ
 _GRAIN_SPEED_PX_PER_S = 50.0  # at this speed half of that is averaged out: a pixel in the filter's memory
@@ -90,8 +105,8 @@ class MotionTrack(Track):
         """Return the covariance of that (px²).
 
         It is the filter's, corrected for errors of observations that come again (a moving light's edges) or to the other side
-        (rows are read out one after the other) and are no white noise, as the filter takes them to be; what a spot's pixels differ by (in rest the same for all time, in motion averaged out), and
-        the latency's uncertainty along the way.
+        (rows are read out one after the other) and are no white noise, as the filter takes them to be; what a spot's pixels
+        differ by (in rest the same for all time, in motion averaged out); and the latency's uncertainty along the way.
         """
         vx, vy = self.vx_px_per_s, self.vy_px_per_s
         grain = _GRAIN_PX**2 / (1.0 + math.hypot(vx, vy) / _GRAIN_SPEED_PX_PER_S)
