@@ -62,7 +62,7 @@ from beacon_comm.core.motion import (
     variance_at,
 )  # fmt: skip
 from beacon_comm.core.motion_tracks import MotionTrack
-from beacon_comm.core.nearest import list_cells
+from beacon_comm.core.nearest import CELL_SHIFT, list_cells
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.routing import Router, cell_of
 from beacon_comm.core.tracks import Track
@@ -153,78 +153,85 @@ def _follow(  # type: ignore[no-untyped-def]
     index, owner, code, count,
 ):  # fmt: skip
     """List the events that are of a track, with their tracks; move the tracks on; return how many, and the cells' lists."""
-    across, down = cells_along_(width), cells_along_(height)
+    across, down = ((width - 1) >> CELL_SHIFT) + 1, ((height - 1) >> CELL_SHIFT) + 1
     step_s = step_ns * 1e-9
     routed = np.int64(0)
-    i = 0
+    i = np.int64(0)
     while i < len(x):
         now = (t_ns[i] - t_hop_ns) // step_ns
+        begin_s = now * step_s
         if now != step[0]:
+            fits = step[0] >= 0
             step[0] = now
             for k in range(len(state)):
-                _lay(state[k], path[k], now * step_s, step_s, factor, margin)
-                _box(path[k], step_s)
+                _lay(state[k], path[k], begin_s, step_s, factor, margin)
+                fits = fits and _is_in_box(path[k], step_s)
             _find_partners(path, state, partner)
-            first, member = list_cells(path[:, _LEFT : _BOTTOM + 1], width, height, across, down)
-        end_ns = t_hop_ns + (now + 1) * step_ns
-        begin_s = now * step_s
-        while i < len(x) and t_ns[i] < end_ns:
-            cell = cell_of(x[i], y[i], across)
-            at, stop = first[cell], first[cell + np.uint64(1)]
-            if at == stop:
-                i += 1
-                continue
-            t_s = (t_ns[i] - t_hop_ns) * 1e-9
-            ex, ey, dt = np.float64(x[i]), np.float64(y[i]), t_s - begin_s
-            nearest2, best, best_x, best_y = np.inf, -1, 0.0, 0.0
-            for m in range(at, stop):
-                k = member[m]
-                dx = ex - (path[k, _PX] + path[k, _PVX] * dt)
-                dy = ey - (path[k, _PY] + path[k, _PVY] * dt)
+            if not fits:
+                first, member = _list_paths(path, step_s, width, height, across, down)
+        stop = i + np.searchsorted(t_ns[i:], t_hop_ns + (now + 1) * step_ns)
+        base = routed
+        near = np.uint64(base)  # unsigned, so that no place is taken to count from the end
+        for one in range(i, stop):
+            cell = cell_of(x[one], y[one], across)
+            index[near] = one
+            near += np.uint64(first[cell] != first[cell + np.uint64(1)])
+        i = stop
+        for j in range(np.uint64(base), near):
+            e = np.uint64(index[j])
+            cell = cell_of(x[e], y[e], across)
+            t_s = (t_ns[e] - t_hop_ns) * 1e-9
+            ex, ey, dt = np.float64(x[e]), np.float64(y[e]), t_s - begin_s
+            nearest2, best, best_x, best_y = np.inf, np.int64(-1), 0.0, 0.0
+            for m in range(np.uint64(first[cell]), np.uint64(first[cell + np.uint64(1)])):
+                one_of = np.int64(member[m])
+                dx = ex - (path[one_of, _PX] + path[one_of, _PVX] * dt)
+                dy = ey - (path[one_of, _PY] + path[one_of, _PVY] * dt)
                 d2 = dx * dx + dy * dy
-                if d2 <= path[k, _RR] and d2 < nearest2:
-                    nearest2, best, best_x, best_y = d2, k, dx, dy
-            if best >= 0:
-                code[i] |= np.uint32(ROUTED)
-                index[routed] = i
-                owner[routed] = best
-                count[best] += 1
-                routed += 1
-                row = state[best]
-                if row[HIDDEN] > 0:
-                    code[i] = _HIDDEN
-                on = np.int64(polarity[i] > 0)
-                row[HOP_OFF + on] += 1.0
-                row[HOP_RR] += nearest2
-                row[LAST] = t_s
-                other = partner[best]
-                fits = True
-                if other >= 0:
-                    dx = ex - (path[other, _PX] + path[other, _PVX] * dt)
-                    dy = ey - (path[other, _PY] + path[other, _PVY] * dt)
-                    scale = 2.0 / min(row[EXTENT], state[other, EXTENT]) ** 2  # 1 / 2σ² of a disc, σ = R / 2
-                    theirs = 1.0 / (1.0 + math.exp(min(scale * (dx * dx + dy * dy - nearest2), 50.0)))
-                    _add(state[other], on, theirs, dx, dy, t_s)
-                    _add(row, on, 1.0 - theirs, best_x, best_y, t_s)
-                    if state[other, N_OFF] + state[other, N_ON] >= UPDATE_EVENTS and _update(state[other], _SHARED, False):
-                        _lay(state[other], path[other], begin_s, step_s, factor, margin)
-                        fits = _is_in_box(path[other], step_s)
-                else:
-                    _add(row, on, 1.0, best_x, best_y, t_s)
-                if row[N_OFF] + row[N_ON] >= UPDATE_EVENTS and _update(row, _SHARED if other >= 0 else 1.0, False):
-                    _lay(row, path[best], begin_s, step_s, factor, margin)
-                    fits &= _is_in_box(path[best], step_s)
-                if not fits:
-                    for k in range(len(state)):
-                        _box(path[k], step_s)
-                    first, member = list_cells(path[:, _LEFT : _BOTTOM + 1], width, height, across, down)
-            i += 1
+                if d2 <= path[one_of, _RR] and d2 < nearest2:
+                    nearest2, best, best_x, best_y = d2, one_of, dx, dy
+            if best < 0:
+                continue
+            row = state[best]
+            code[e] = _HIDDEN if row[HIDDEN] > 0 else code[e] | np.uint32(ROUTED)
+            index[routed] = e
+            owner[routed] = best
+            count[best] += 1
+            routed += 1
+            on = np.int64(polarity[e] > 0)
+            row[HOP_OFF + on] += 1.0
+            row[HOP_RR] += nearest2
+            row[LAST] = t_s
+            other = partner[best]
+            fits = True
+            if other >= 0:
+                dx = ex - (path[other, _PX] + path[other, _PVX] * dt)
+                dy = ey - (path[other, _PY] + path[other, _PVY] * dt)
+                scale = 2.0 / min(row[EXTENT], state[other, EXTENT]) ** 2  # 1 / 2σ² of a disc, σ = R / 2
+                theirs = 1.0 / (1.0 + math.exp(min(scale * (dx * dx + dy * dy - nearest2), 50.0)))
+                _add(state[other], on, theirs, dx, dy, t_s)
+                _add(row, on, 1.0 - theirs, best_x, best_y, t_s)
+                if state[other, N_OFF] + state[other, N_ON] >= UPDATE_EVENTS and _update(state[other], _SHARED, False):
+                    _lay(state[other], path[other], begin_s, step_s, factor, margin)
+                    fits = _is_in_box(path[other], step_s)
+            else:
+                _add(row, on, 1.0, best_x, best_y, t_s)
+            if row[N_OFF] + row[N_ON] >= UPDATE_EVENTS and _update(row, _SHARED if other >= 0 else 1.0, False):
+                _lay(row, path[best], begin_s, step_s, factor, margin)
+                fits &= _is_in_box(path[best], step_s)
+            if not fits:
+                first, member = _list_paths(path, step_s, width, height, across, down)
+                i = np.int64(e) + 1  # what is near is another question now
+                break
     return routed, first, member
 
 
 @njit(cache=True, nogil=True)
-def cells_along_(length_px):  # type: ignore[no-untyped-def]
-    return ((length_px - 1) >> 4) + 1
+def _list_paths(path, step_s, width, height, across, down):  # type: ignore[no-untyped-def]
+    """List anew which paths may touch each cell."""
+    for k in range(len(path)):
+        _box(path[k], step_s)
+    return list_cells(path[:, _LEFT : _BOTTOM + 1], width, height, across, down)
 
 
 @njit(cache=True, nogil=True)
@@ -245,7 +252,7 @@ def _lay(row, path, begin_s, step_s, factor, margin):  # type: ignore[no-untyped
 @njit(cache=True, nogil=True)
 def _box(path, step_s):  # type: ignore[no-untyped-def]
     radius = path[_RADIUS] + _SLACK_PX
-    dx, dy = path[_PVX] * step_s, path[_PVY] * step_s
+    dx, dy = 2.0 * path[_PVX] * step_s, 2.0 * path[_PVY] * step_s
     path[_LEFT], path[_RIGHT] = path[_PX] + min(dx, 0.0) - radius, path[_PX] + max(dx, 0.0) + radius
     path[_TOP], path[_BOTTOM] = path[_PY] + min(dy, 0.0) - radius, path[_PY] + max(dy, 0.0) + radius
 
