@@ -47,6 +47,7 @@ TEXTS = ("Shall I compare thee to a summer's day? ", 'And summers lease hath all
 SLOW, HOLD_S, RAMP_END_S = 80.0, 0.3, 0.6
 BEGIN_S = 0.8
 RADIUS_PX = 5.1
+ERRORS_S = 1.3
 TRACKERS = ('nearest', 'motion')
 Simulated = tuple[Iterator[EventBatch], SceneTruth]
 
@@ -170,8 +171,8 @@ def nearest(detector: Detector, truth: BeaconTruth, t_ns: int) -> tuple[Track | 
 def speeds(full: bool) -> dict[str, Any]:
     """Characters right against image speed."""
     found: dict[str, Any] = {}
-    characters = 1000 if full else 150
-    points = (100, 500, 1000, 2000, 3000, 5000, 8000, 11000) if full else (100, 1000, 2000, 5000, 11000)
+    characters = 1000 if full else 100
+    points = (100, 500, 1000, 2000, 3000, 5000, 8000, 11000) if full else (500, 2000, 5000, 11000)
     for kind in ('line', 'circle'):
         for speed in tqdm(points, desc=kind):
             for tracker in TRACKERS:
@@ -323,12 +324,12 @@ def looked_at(simulated: Simulated, kind: str) -> np.ndarray:
     """Return errors (px), normalised error squared and trace of the covariance (px²) of the track of one beacon, ``(n, 4)``."""
     rows: list[list[float]] = []
     (beacon,) = simulated[1].beacons
-    out_s = turns_s(beacon, 1.3) if kind == 'line' else np.empty(0)
+    out_s = turns_s(beacon, ERRORS_S) if kind == 'line' else np.empty(0)
 
     def look(detector: Detector, truth: SceneTruth, t_hop_ns: int) -> None:
         for t_ns in (t_hop_ns, t_hop_ns + 4_000_000):
             t_s = t_ns / NS_PER_S
-            if t_s < BEGIN_S or np.any((t_s > out_s) & (t_s < out_s + 0.02)):
+            if not BEGIN_S <= t_s < ERRORS_S or np.any((t_s > out_s) & (t_s < out_s + 0.02)):
                 continue
             track, distance = nearest(detector, beacon, t_ns)
             if track is None or distance > 5 * RADIUS_PX:
@@ -350,7 +351,7 @@ def errors(full: bool) -> dict[str, Any]:
         ('line, 2000 px/s', 'line', 2000.0), ('circle, 1000 px/s', 'circle', 1000.0),
     ):  # fmt: skip
         seeds = tqdm(range(40 if full else 8), desc=name)
-        table = np.concatenate([looked_at(scene([moving(kind, speed, seed)], 1.3, 1000 + seed), kind) for seed in seeds])
+        table = np.concatenate([looked_at(scene([moving(kind, speed, seed)], ERRORS_S, 1000 + seed), kind) for seed in seeds])
         lost = float(np.isnan(table[:, 0]).mean())
         table = table[~np.isnan(table[:, 0])]
         found[name] = {
