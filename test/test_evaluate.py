@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from beacon_comm.recordings.bag_writer import BagWriter
 from beacon_comm.recordings.disc import Disc
 from beacon_comm.recordings.scene import Scene
 from beacon_comm.recordings.sources import Beacon
+from beacon_comm.recordings.truth import write_truth
 from beacon_comm.simulation.led import simulate_text
 
 PROJECT = Path(__file__).resolve().parents[1]
@@ -45,8 +47,10 @@ def check_schema(result: object, receiver: str = 'sequence') -> None:
     number = (int, float)
     assert isinstance(result, dict)
     assert list(result) == [
-        'recording', 'receiver', 'events', 'seconds', 'mev_per_s', 'lost_packets', 'skipped_words', 'beacons',
+        'schema', 'recording', 'receiver', 'events', 'seconds', 'mev_per_s', 'lost_packets', 'skipped_words', 'beacons',
+        'scene',
     ]  # fmt: skip
+    assert result['schema'] == 2
     assert isinstance(result['recording'], str)
     assert result['receiver'] == receiver
     assert all(type(result[key]) is int for key in ('events', 'lost_packets', 'skipped_words'))
@@ -82,6 +86,36 @@ def check_schema(result: object, receiver: str = 'sequence') -> None:
             assert 0.0 <= transmission['bit_accuracy'] <= 1.0
 
 
+def check_scene(scene: dict) -> None:
+    """Check every key of a scene's scores."""
+    assert list(scene) == [
+        'sent', 'confirmed', 'tracks', 'false_confirmations', 'on_reflections', 'stray_characters', 'beacons',
+    ]  # fmt: skip
+    tracking = [
+        'objects', 'reports', 'matches', 'misses', 'false_positives', 'id_switches', 'fragmentations', 'swaps',
+        'mostly_tracked', 'partly_tracked', 'mostly_lost', 'mota', 'motp_px', 'idf1', 'id_precision', 'id_recall', 'hota',
+        'detection_accuracy', 'association_accuracy',
+    ]  # fmt: skip
+    assert list(scene['tracks']) == tracking
+    assert list(scene['confirmed']) == [*tracking, 'mota_interval', 'motp_interval_px']
+    count = [
+        'characters', 'wrong', 'missing', 'inserted', 'wrong_ok', 'bits', 'wrong_bits',
+        'message_accuracy', 'message_interval', 'bit_accuracy', 'bit_interval',
+    ]  # fmt: skip
+    assert list(scene['sent']) == count
+    for beacon in scene['beacons']:
+        assert list(beacon) == [
+            'name', 'kind', 'bit_rate_bps', 'seen_s', 'tracks', 'sent', 'locks', 'confirm_s', 'position',
+        ]  # fmt: skip
+        assert beacon['sent'] is None or list(beacon['sent']) == count
+        assert all(list(lock) == ['begin_s', 'lock_s', 'lost'] for lock in beacon['locks'])
+        if beacon['position'] is not None:
+            assert list(beacon['position']) == [
+                'instants', 'rms_px', 'rms_interval_px', 'median_px', 'p95_px', 'speed_px_per_s', 'lag_s',
+                'nees', 'nees_interval', 'bearing_rms_rad',
+            ]  # fmt: skip
+
+
 @pytest.fixture(scope='module')
 def mat_file(tmp_path_factory) -> Path:
     """Return a recording of four sendings of a short text at 3125 bit/s."""
@@ -99,13 +133,25 @@ def beacon(text: str, bit_rate_bps: float, disc: Disc, seed: int) -> Beacon:
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory) -> Path:
     """Return a bag of 1 s: one beacon that moves and stops sending in mid-text, one that stands still."""
+    return write_scene(tmp_path_factory.mktemp('bag') / 'scene', truth=False)
+
+
+@pytest.fixture(scope='module')
+def scene(tmp_path_factory) -> Path:
+    """Return the same bag with its truth beside it."""
+    return write_scene(tmp_path_factory.mktemp('scene') / 'scene', truth=True)
+
+
+def write_scene(folder: Path, truth: bool) -> Path:
     moving = beacon((TEXT * 6)[:100], 3125.0, Disc(40.0, 60.0, 4.0, 50.0, 20.0, 200, 160), 1)
     still = beacon('Another text, and a longer one. ' * 8, 3125.0, Disc(140.0, 100.0, 4.0, 0.0, 0.0, 200, 160), 2)
-    folder = tmp_path_factory.mktemp('bag') / 'scene'
+    made = Scene((moving, still), 200, 160)
     with BagWriter(folder) as writer:
         writer.add_topic('/event_camera/events', 'event_camera_msgs/msg/EventPacket')
-        for recorded_ns, cdr in Scene((moving, still), 200, 160).packets():
+        for recorded_ns, cdr in made.packets():
             writer.write('/event_camera/events', recorded_ns, cdr)
+    if truth:
+        write_truth(folder / 'truth.json', made)
     return folder
 
 
@@ -208,6 +254,43 @@ def test_a_bag_with_two_beacons(bag, capsys, tmp_path) -> None:
     assert sum(transmission['wrong'] for transmission in moving['transmissions']) <= 2
     assert still['transmissions'][0]['start_s'] is None
     assert 'not found' in out
+
+
+def test_a_truth_beside_the_bag_is_found(scene, capsys, tmp_path) -> None:
+    out_file = tmp_path / 'out.json'
+    code, out, err = run(capsys, scene, '--bit-rate', '3125', '--json', out_file)
+    assert (code, err) == (0, '')
+    result = json.loads(out_file.read_text())
+    check_schema(result)
+    check_scene(result['scene'])
+    moving, still = result['scene']['beacons']
+    assert moving['sent']['wrong'] + still['sent']['wrong'] <= 3
+    assert (moving['sent']['characters'], still['sent']['characters']) == (pytest.approx(100, abs=2), pytest.approx(256, abs=2))
+    assert moving['position']['rms_px'] < 1.0 and still['position']['rms_px'] < 0.3
+    assert all(0.0 < beacon['locks'][0]['lock_s'] < beacon['confirm_s'] < 0.3 for beacon in (moving, still))
+    confirmed = result['scene']['confirmed']
+    assert (confirmed['id_switches'], confirmed['swaps'], result['scene']['false_confirmations']) == (0, 0, [])
+    assert confirmed['matches'] + confirmed['misses'] == confirmed['objects']
+    assert 'MOTA' in out and 'IDF1' in out
+    path = result['beacons'][0]['path']
+    assert np.diff([point[0] for point in path]).max() == pytest.approx(0.009, abs=1e-6)
+
+
+def test_no_truth_means_none(scene, capsys, tmp_path) -> None:
+    out_file = tmp_path / 'out.json'
+    code, out, _ = run(capsys, scene, '--bit-rate', '3125', '--truth', 'none', '--json', out_file)
+    assert code == 0
+    assert json.loads(out_file.read_text())['scene'] is None
+    assert 'MOTA' not in out and 'message accuracy' not in out
+
+
+def test_a_damaged_truth_is_one_line(scene, capsys, tmp_path) -> None:
+    copy = tmp_path / 'copy'
+    shutil.copytree(scene, copy)
+    (copy / 'truth.json').write_text('{"schema": 1')
+    code, _, err = run(capsys, copy, '--bit-rate', '3125')
+    assert (code, err.count('\n')) == (2, 1)
+    assert 'truth.json: cannot be read' in err
 
 
 def test_one_that_cannot_be_read_does_not_keep_the_others(mat_file, capsys, tmp_path) -> None:
@@ -348,6 +431,11 @@ def test_the_document_names_every_key() -> None:
     keys = (
         'recording receiver events seconds mev_per_s lost_packets skipped_words beacons track_id state confirmed_at_s'
         ' bit_rate_bps text path characters transmissions t_s code status confidence start_s wrong wrong_ok repaired'
-        ' inserted message_accuracy bit_accuracy'
+        ' inserted message_accuracy bit_accuracy schema scene sent confirmed tracks false_confirmations on_reflections'
+        ' stray_characters objects reports matches misses false_positives id_switches fragmentations swaps mostly_tracked'
+        ' partly_tracked mostly_lost mota motp_px idf1 id_precision id_recall hota detection_accuracy association_accuracy'
+        ' mota_interval motp_interval_px message_interval bit_interval bits wrong_bits missing name kind seen_s locks begin_s'
+        ' lock_s lost confirm_s position instants rms_px rms_interval_px median_px p95_px speed_px_per_s lag_s nees'
+        ' nees_interval bearing_rms_rad'
     )
     assert [key for key in keys.split() if f'`{key}`' not in document] == []

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
 
 from beacon_comm.core.candidates import BeaconState
 from beacon_comm.core.character import Character
@@ -20,13 +22,15 @@ class _Account:
     azimuth_rad: float | None = None
     elevation_rad: float | None = None
     path: list[PathPoint] = field(default_factory=list)
-    characters: list[Character] = field(default_factory=list)
+    received: list[tuple[Character, int]] = field(default_factory=list)
+    confirmed_seen_ns: int | None = None
 
     @property
     def silent(self) -> bool:
-        return not self.characters and self.confirmed_at_ns is None
+        return not self.received and self.confirmed_at_ns is None
 
     def result(self) -> BeaconResult:
+        received = sorted(self.received, key=lambda one: one[0].t_ns)
         return BeaconResult(
             track_id=self.track_id,
             state=self.state,
@@ -35,7 +39,9 @@ class _Account:
             azimuth_rad=self.azimuth_rad,
             elevation_rad=self.elevation_rad,
             path=tuple(self.path),
-            characters=tuple(sorted(self.characters, key=lambda character: character.t_ns)),
+            characters=tuple(character for character, _ in received),
+            received_ns=tuple(at_ns for _, at_ns in received),
+            confirmed_seen_ns=self.confirmed_seen_ns,
         )
 
 
@@ -49,34 +55,43 @@ class Collector:
     def __init__(self, origin_ns: int = 0) -> None:
         self.origin_ns = origin_ns
         self._accounts: dict[int, _Account] = {}
+        self._instants_ns: list[int] = []
+
+    @property
+    def instants_ns(self) -> NDArray[np.int64]:
+        """When the tracks were sampled (recording time, ns), increasing, ``(n,)`` int64."""
+        return np.array(self._instants_ns, np.int64)
 
     def take(self, output: Output, receiver: Receiver) -> None:
         """Take what a push, a flush or a restart gave."""
+        now_ns = (receiver.t_ns or 0) - self.origin_ns
         for received in output.characters:
-            character = received.character
-            self._account(received.track_id).characters.append(
-                replace(character, t_ns=character.t_ns - self.origin_ns)
-            )
+            character = replace(received.character, t_ns=received.character.t_ns - self.origin_ns)
+            self._account(received.track_id).received.append((character, now_ns))
         for snapshot in output.lost:
             self._note(snapshot)
         if output.confirmed_changed:
             for snapshot in receiver.beacons():
-                self._note(snapshot)
+                account = self._note(snapshot)
+                if snapshot.state is BeaconState.CONFIRMED and account.confirmed_seen_ns is None:
+                    account.confirmed_seen_ns = now_ns
 
-    def sample(self, snapshots: Iterable[BeaconSnapshot]) -> None:
-        """Take all tracks at one instant: a point of their paths."""
-        for snapshot in snapshots:
+    def sample(self, receiver: Receiver) -> None:
+        """Take all tracks as they are now: a point of their paths."""
+        now_ns = (receiver.t_ns or 0) - self.origin_ns
+        if not self._instants_ns or self._instants_ns[-1] < now_ns:
+            self._instants_ns.append(now_ns)
+        for snapshot in receiver.beacons():
             t_ns = snapshot.t_ns - self.origin_ns
-            point = PathPoint(t_ns, snapshot.x_px, snapshot.y_px, snapshot.extent_px)
             path = self._note(snapshot).path
             if not path or path[-1].t_ns < t_ns:
-                path.append(point)
+                path.append(_point(snapshot, t_ns))
 
-    def beacons(self) -> tuple[tuple[BeaconResult, ...], int]:
-        """Return the tracks that gave characters or were confirmed, by label, and the number of the others."""
+    def beacons(self) -> tuple[tuple[BeaconResult, ...], tuple[BeaconResult, ...]]:
+        """Return the tracks that gave characters or were confirmed, by label, and the others."""
         accounts = [account for _, account in sorted(self._accounts.items())]
         speaking = tuple(account.result() for account in accounts if not account.silent)
-        return speaking, len(accounts) - len(speaking)
+        return speaking, tuple(account.result() for account in accounts if account.silent)
 
     def whole_signal(self) -> BeaconResult:
         """Return everything as one beacon: a recording without pixels holds no other."""
@@ -84,13 +99,15 @@ class Collector:
         if not accounts:
             return _Account(track_id=1).result()
         confirmed_ns = [account.confirmed_at_ns for account in accounts if account.confirmed_at_ns is not None]
+        seen_ns = [account.confirmed_seen_ns for account in accounts if account.confirmed_seen_ns is not None]
         rates = [account.bit_rate_bps for account in accounts if account.bit_rate_bps is not None]
         whole = _Account(
             accounts[0].track_id,
             accounts[-1].state,
             min(confirmed_ns, default=None),
             rates[-1] if rates else None,
-            characters=[character for account in accounts for character in account.characters],
+            received=[received for account in accounts for received in account.received],
+            confirmed_seen_ns=min(seen_ns, default=None),
         )
         return whole.result()
 
@@ -107,3 +124,17 @@ class Collector:
         if snapshot.azimuth_rad is not None:
             account.azimuth_rad, account.elevation_rad = snapshot.azimuth_rad, snapshot.elevation_rad
         return account
+
+
+def _point(snapshot: BeaconSnapshot, t_ns: int) -> PathPoint:
+    return PathPoint(
+        t_ns,
+        snapshot.x_px,
+        snapshot.y_px,
+        snapshot.extent_px,
+        snapshot.state is BeaconState.CONFIRMED,
+        snapshot.quiet,
+        snapshot.azimuth_rad,
+        snapshot.elevation_rad,
+        getattr(snapshot, 'covariance_px2', None),
+    )

@@ -16,7 +16,15 @@ from beacon_comm.cli.parser import EXIT_ERROR, EXIT_OK, OneLineParser
 from beacon_comm.core.errors import BeaconCommError, CalibrationError, ParameterError, RecordingError
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.parameters import Parameters
-from beacon_comm.evaluation.report import listed, published_table, recordings_table, scores_table, texts_table
+from beacon_comm.evaluation.report import (
+    beacons_table,
+    listed,
+    published_table,
+    recordings_table,
+    scores_table,
+    texts_table,
+    tracking_table,
+)
 from beacon_comm.evaluation.result import RecordingResult
 from beacon_comm.evaluation.result_json import write_json
 from beacon_comm.evaluation.truth import load_truth
@@ -25,6 +33,7 @@ if TYPE_CHECKING:
     from beacon_comm.core.bearing import CameraModel
 
 NAME = 'beacon_evaluate'
+NO_TRUTH = 'none'
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -41,7 +50,10 @@ def make_parser() -> argparse.ArgumentParser:
         help="a bag (rosbag2, ROS 1) or a .mat file of one beacon's events (with --stress by default the paper's at 30 m)",
     )
     parser.add_argument(
-        '--truth', metavar='TEXT', help='what was sent: sonnet18, a text file (every byte of it counts), or the text'
+        '--truth',
+        metavar='TEXT',
+        help="what was sent: sonnet18, a text file (every byte of it counts), or the text; a scene's truth.json beside a bag is"
+        ' found by itself; none: not even that',
     )
     add_parameter_arguments(parser)
     parser.add_argument('--camera', metavar='YAML', help='calibration of the camera, for bearings')
@@ -97,6 +109,7 @@ def _run(arguments: argparse.Namespace) -> int:
         arguments.topic,
         arguments.start,
         arguments.duration,
+        arguments.truth != NO_TRUTH,
     )
     warm_up(parameters, pixels=not all(map(is_mat, arguments.recordings)))
     results: list[RecordingResult] = []
@@ -193,6 +206,9 @@ def print_results(results: Sequence[RecordingResult], scored: bool, comparable: 
     print(recordings_table(results))
     if any(listed(result) for result in results):
         print('\n' + texts_table(results))
+    if any(result.scene is not None for result in results):
+        print('\nAgainst the truth beside the bag, brackets are 95 % intervals:\n' + beacons_table(results))
+        print('\n' + tracking_table(results))
     if scored and any(beacon.transmissions for result in results for beacon in result.beacons):
         print('\n' + scores_table(results))
         published = published_table(results) if comparable else None
@@ -204,7 +220,7 @@ def print_results(results: Sequence[RecordingResult], scored: bool, comparable: 
 
 def _truth(argument: str | None, parameters: Parameters) -> str | None:
     """Return the text; one that cannot have been sent is refused before anything is read."""
-    if argument is None:
+    if argument is None or argument == NO_TRUTH:
         return None
     text = load_truth(argument)
     CharacterFrame.from_parameters(parameters).encode_bits(text)

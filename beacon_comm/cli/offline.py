@@ -1,7 +1,10 @@
 """The receiver over a recording, as fast as it goes: no ROS, no clock but the events'.
 
-    bag  ──► BagPieces ──► cut every 20 ms ──► Receiver ───────► Collector ──► beacons ──► scores
+    bag  ──► BagPieces ──► cut every 20 ms ──► Receiver ───────► Collector ──► beacons ──► scores ◄── truth beside it
     .mat ──► read_mat ───► cut every 100 ms ─► SignalReceiver ──►
+
+With a scene's truth the stream is cut every 3 ms, so that it is known when something was given out, and the tracks are sampled
+every 9 ms, so that every phase of the hops of 10 ms occurs.
 
 All times of the results are recording time: ns since the recording's first event.
 """
@@ -18,6 +21,7 @@ from numpy.typing import NDArray
 from beacon_comm.cli.bag_pieces import BagPieces
 from beacon_comm.cli.collector import Collector
 from beacon_comm.cli.progress import progress
+from beacon_comm.cli.scene_truth import scored_scene, truth_beside
 from beacon_comm.core.bearing import CameraModel
 from beacon_comm.core.errors import RecordingError
 from beacon_comm.core.events import NS_PER_S, EventBatch
@@ -30,8 +34,11 @@ from beacon_comm.evaluation.result import BeaconResult, RecordingResult
 from beacon_comm.evaluation.scoring import Transmission, not_found, score
 from beacon_comm.recordings.bags import open_recording
 from beacon_comm.recordings.mat import read_mat
+from beacon_comm.simulation.truth import SceneTruth
 
 SAMPLE_NS = 20_000_000
+SCENE_STEP_NS = 3_000_000
+SCENE_SAMPLE_NS = 3 * SCENE_STEP_NS
 MAT_BATCH_NS = 100_000_000
 LONGEST_SAMPLED_NS = 60 * NS_PER_S
 
@@ -46,6 +53,7 @@ class Options:
         camera: calibration, None: pixels only.
         topic: event topic of a bag, None: the only one.
         start_s, duration_s: part of the recording, from its first event (s); duration None: to its end.
+        scene_truth: whether to score a bag against the scene's truth where it lies beside it.
     """
 
     parameters: Parameters
@@ -54,6 +62,7 @@ class Options:
     topic: str | None = None
     start_s: float = 0.0
     duration_s: float | None = None
+    scene_truth: bool = True
 
     @property
     def window_ns(self) -> tuple[int, int | None]:
@@ -70,8 +79,11 @@ def evaluate_recording(path: str, options: Options) -> RecordingResult:
     """
     if is_mat(path):
         return _evaluate_mat(path, options)
+    scene = truth_beside(path) if options.scene_truth else None
+    if scene is not None and scene.camera is not None and options.camera is None:
+        options = replace(options, camera=scene.camera.calibration())
     with open_recording(path) as bag:
-        return _evaluate_bag(path, BagPieces(path, bag, options.topic, options.window_ns), options)
+        return _evaluate_bag(path, BagPieces(path, bag, options.topic, options.window_ns), options, scene)
 
 
 def is_mat(path: str) -> bool:
@@ -134,14 +146,15 @@ def receive_signal(
         collector.take(receiver.push_signal(t_ns[start:stop], polarity[start:stop], cut_ns), receiver)
         start = stop
     collector.take(receiver.flush(), receiver)
-    collector.sample(receiver.beacons())
+    collector.sample(receiver)
     return collector.whole_signal()
 
 
-def _evaluate_bag(path: str, pieces: BagPieces, options: Options) -> RecordingResult:
+def _evaluate_bag(path: str, pieces: BagPieces, options: Options, scene: SceneTruth | None) -> RecordingResult:
     collector = Collector()
     begun_s = time.perf_counter()
-    events, end_ns = _receive(pieces, collector, options)
+    step_ns, sample_ns = (SAMPLE_NS, SAMPLE_NS) if scene is None else (SCENE_STEP_NS, SCENE_SAMPLE_NS)
+    events, end_ns, size = _receive(pieces, collector, options, step_ns, sample_ns)
     processing_s = time.perf_counter() - begun_s
     if end_ns is None:
         raise RecordingError(pieces.problem or f'{path}: no events in the part asked for')
@@ -149,6 +162,15 @@ def _evaluate_bag(path: str, pieces: BagPieces, options: Options) -> RecordingRe
     beacons, silent = collector.beacons()
     if options.truth is not None:
         beacons = _scored_beacons(beacons, pieces, options, (begin_ns, end_ns))
+    scored = None if scene is None else scored_scene(
+        scene,
+        (*beacons, *silent),
+        collector.instants_ns,
+        collector.origin_ns,
+        (begin_ns, end_ns),
+        CharacterFrame.from_parameters(options.parameters),
+        options.truth,
+    )
     return RecordingResult(
         recording=path,
         receiver=options.parameters.receiver,
@@ -158,39 +180,51 @@ def _evaluate_bag(path: str, pieces: BagPieces, options: Options) -> RecordingRe
         lost_packets=pieces.counts['lost_packets'],
         skipped_words=pieces.counts['skipped_words'],
         beacons=beacons,
-        silent_tracks=silent,
+        silent_tracks=len(silent),
         problem=pieces.problem,
+        scene=scored,
+        width=size[0],
+        height=size[1],
+        silent=silent,
     )
 
 
-def _receive(pieces: BagPieces, collector: Collector, options: Options) -> tuple[int, int | None]:
-    """Push a bag through a receiver; return the number of events and the end (recording time), None without any."""
+def _receive(
+    pieces: BagPieces, collector: Collector, options: Options, step_ns: int, sample_ns: int
+) -> tuple[int, int | None, tuple[int, int]]:
+    """Push a bag through a receiver, cut at every step, and sample the tracks.
+
+    Returns:
+        The number of events, the end (recording time, ns), None without any, and the sensor's size (px).
+    """
     receiver: Receiver | None = None
     events = 0
+    size = (0, 0)
     reached_ns: int | None = None
     end_ns: int | None = None
     for piece in pieces:
+        size = (piece.width, piece.height)
         if receiver is None:
             if options.camera is not None:
-                options.camera.check_size((piece.width, piece.height))
-            receiver = Receiver(options.parameters, (piece.width, piece.height), options.camera)
+                options.camera.check_size(size)
+            receiver = Receiver(options.parameters, size, options.camera)
         elif piece.restarted:
             collector.take(receiver.reset(), receiver)
             reached_ns = None
         if piece.resized:
-            collector.take(receiver.resize((piece.width, piece.height)), receiver)
+            collector.take(receiver.resize(size), receiver)
         collector.origin_ns = piece.origin_ns
-        for batch in cut_batch(piece.batch, SAMPLE_NS, reached_ns):
+        for batch in cut_batch(piece.batch, step_ns, reached_ns):
             collector.take(receiver.push(batch), receiver)
-            if batch.t_end_ns % SAMPLE_NS == 0:
-                collector.sample(receiver.beacons())
+            if batch.t_end_ns % sample_ns == 0:
+                collector.sample(receiver)
         events += len(piece.batch)
         reached_ns = piece.batch.t_end_ns
         end_ns = reached_ns - piece.origin_ns
     if receiver is not None:
         collector.take(receiver.flush(), receiver)
-        collector.sample(receiver.beacons())
-    return events, end_ns
+        collector.sample(receiver)
+    return events, end_ns, size
 
 
 def cut_batch(batch: EventBatch, grid_ns: int, reached_ns: int | None) -> Iterator[EventBatch]:

@@ -9,6 +9,7 @@ from pathlib import PurePath
 
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.evaluation.result import BeaconResult, RecordingResult
+from beacon_comm.evaluation.scene_score import PositionScore
 from beacon_comm.evaluation.scoring import Interval, Transmission
 
 SCORE_COLUMNS = (
@@ -19,6 +20,15 @@ TEXT_COLUMNS = ('recording', 'track', 'state', 'bit/s', 'confirmed', 'bearing', 
 RECORDING_COLUMNS = (
     'recording', 'events', 'seconds', 'Mev/s', 'lost packets', 'skipped words', 'beacons', 'other tracks',
 )  # fmt: skip
+BEACON_COLUMNS = (
+    'recording', 'beacon', 'bit/s', 'tracks', 'characters', 'wrong', 'wrong ok', 'message accuracy', 'bit accuracy',
+    'locked', 'confirmed', 'px/s', 'error rms', 'p95', 'lag', 'NEES',
+)  # fmt: skip
+TRACKING_COLUMNS = (
+    'recording', 'reports', 'MOTA', 'MOTP', 'IDF1', 'HOTA', 'ID switches', 'swaps', 'fragmentations', 'missed',
+    'false positives', 'false confirmations',
+)  # fmt: skip
+LEFT = ('recording', 'beacon', 'reports', 'state', 'end of text')
 # Characters of a text that a table shows.
 SHOWN_TEXT = 48
 
@@ -44,7 +54,7 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a table with aligned columns; numbers and all but the first column stand right, texts left."""
     cells = [tuple(columns), *(tuple(row) for row in rows)]
     widths = [max(len(row[column]) for row in cells) for column in range(len(columns))]
-    left = {column for column, name in enumerate(columns) if name in ('recording', 'state', 'end of text')}
+    left = {column for column, name in enumerate(columns) if name in LEFT}
     lines = [
         '  '.join(
             cell.ljust(width) if column in left else cell.rjust(width)
@@ -83,6 +93,86 @@ def scores_table(results: Sequence[RecordingResult]) -> str:
         for beacon in result.beacons:
             rows += [_score_row(result, beacon, transmission) for transmission in beacon.transmissions]
     return table(SCORE_COLUMNS, rows)
+
+
+def beacons_table(results: Sequence[RecordingResult]) -> str:
+    """Return one row a true beacon of a scene: characters, times, errors, with 95 % confidence intervals."""
+    return table(BEACON_COLUMNS, beacon_rows(results))
+
+
+def beacon_rows(results: Sequence[RecordingResult]) -> list[tuple[str, ...]]:
+    """Return the rows of :func:`beacons_table`."""
+    rows = []
+    for result in results:
+        for beacon in () if result.scene is None else result.scene.beacons:
+            count = beacon.sent
+            known = bool(beacon.transmissions)
+            rows.append(
+                (
+                    _name(result),
+                    beacon.name,
+                    '-' if beacon.bit_rate_bps is None else f'{beacon.bit_rate_bps:g}',
+                    ', '.join(map(str, beacon.tracks)) or 'none',
+                    str(count.characters) if known else '-',
+                    str(count.wrong) if known else '-',
+                    str(count.wrong_ok) if known else '-',
+                    _share(count.message_accuracy, count.message_interval, 3) if known else '-',
+                    _share(count.bit_accuracy, count.bit_interval, 4) if known else '-',
+                    _milliseconds(beacon.locks[0].lock_s) if beacon.locks else '-',
+                    _milliseconds(beacon.confirm_s),
+                    *_position_cells(beacon.position),
+                )
+            )
+    return rows
+
+
+def tracking_table(results: Sequence[RecordingResult]) -> str:
+    """Return two rows a scene, the confirmed tracks and all: the field's measures, with 95 % confidence intervals."""
+    return table(TRACKING_COLUMNS, tracking_rows(results))
+
+
+def tracking_rows(results: Sequence[RecordingResult]) -> list[tuple[str, ...]]:
+    """Return the rows of :func:`tracking_table`."""
+    rows = []
+    for result in results:
+        scene = result.scene
+        if scene is None:
+            continue
+        for name, score in (('confirmed', scene.confirmed), ('all tracks', scene.tracks)):
+            of_confirmed = score is scene.confirmed
+            mota, motp = (scene.mota_interval, scene.motp_interval) if of_confirmed else (None, None)
+            rows.append(
+                (
+                    _name(result),
+                    name,
+                    '-' if score.mota is None else _share(score.mota, mota, 3),
+                    '-' if score.motp_px is None else _share(score.motp_px, motp, 2) + ' px',
+                    *('-' if value is None else f'{value:.3f}' for value in (score.idf1, score.hota)),
+                    str(score.id_switches),
+                    str(score.swaps),
+                    str(score.fragmentations),
+                    f'{score.misses} of {score.objects}',
+                    str(score.false_positives),
+                    str(len(scene.false_confirmations)) if of_confirmed else '-',
+                )
+            )
+    return rows
+
+
+def _position_cells(position: PositionScore | None) -> tuple[str, ...]:
+    if position is None:
+        return ('-',) * 5
+    return (
+        f'{position.speed_px_per_s:.0f}',
+        _share(position.rms_px, position.interval_px, 2) + ' px',
+        f'{position.p95_px:.2f} px',
+        _milliseconds(position.lag_s, 2),
+        '-' if position.nees is None else _share(position.nees, position.nees_interval, 2),
+    )
+
+
+def _milliseconds(value_s: float | None, digits: int = 0) -> str:
+    return '-' if value_s is None else f'{1e3 * value_s:.{digits}f} ms'
 
 
 def texts_table(results: Sequence[RecordingResult]) -> str:

@@ -6,10 +6,14 @@ Times are *recording time*: ns since the recording's first event.  It goes on wh
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from beacon_comm.core.candidates import BeaconState
 from beacon_comm.core.character import Character
 from beacon_comm.evaluation.scoring import Transmission
+
+if TYPE_CHECKING:
+    from beacon_comm.evaluation.scene_score import SceneScore
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,12 +24,21 @@ class PathPoint:
         t_ns: recording time (ns).
         x_px, y_px: centre (px).
         extent_px: radius of the blob (px).
+        confirmed: whether it was confirmed then.
+        quiet: no events in the last window; the position is predicted.
+        azimuth_rad, elevation_rad: bearing, None without calibration.
+        covariance_px2: of the centre, as xx, xy, yy (px²); None: the receiver states none.
     """
 
     t_ns: int
     x_px: float
     y_px: float
     extent_px: float
+    confirmed: bool = False
+    quiet: bool = False
+    azimuth_rad: float | None = None
+    elevation_rad: float | None = None
+    covariance_px2: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,9 +51,11 @@ class BeaconResult:
         confirmed_at_ns: when it was first confirmed (recording time, ns), None: never.
         bit_rate_bps: last settled bit rate (bit/s), None: none.
         azimuth_rad, elevation_rad: last bearing, None without calibration.
-        path: its positions, every 20 ms of event time; empty for a recording without pixels.
+        path: its positions, every 20 ms of event time (9 ms with a scene's truth); empty for a recording without pixels.
         characters: decoded characters in order of time, ``t_ns`` in recording time.
         transmissions: scores against the truth, in order of time; empty without a truth.
+        received_ns: when each character was given out: the stream's time then (recording time, ns), ``characters``' order.
+        confirmed_seen_ns: when the receiver first said that it is confirmed (recording time, ns), None: never.
     """
 
     track_id: int
@@ -52,6 +67,8 @@ class BeaconResult:
     path: tuple[PathPoint, ...]
     characters: tuple[Character, ...]
     transmissions: tuple[Transmission, ...] = ()
+    received_ns: tuple[int, ...] = ()
+    confirmed_seen_ns: int | None = None
 
     @property
     def text(self) -> str:
@@ -74,6 +91,9 @@ class RecordingResult:
         beacons: tracks that were confirmed or gave characters, by label.
         silent_tracks: tracks that did neither.
         problem: what could not be read, None if all could.
+        scene: scores against the scene's truth, None where there is none beside the recording.
+        width, height: sensor size (px), None for a recording without pixels.
+        silent: the other tracks, kept where there is a scene's truth.
     """
 
     recording: str
@@ -86,6 +106,10 @@ class RecordingResult:
     beacons: tuple[BeaconResult, ...]
     silent_tracks: int
     problem: str | None = None
+    scene: SceneScore | None = None
+    width: int | None = None
+    height: int | None = None
+    silent: tuple[BeaconResult, ...] = ()
 
     @property
     def mev_per_s(self) -> float:

@@ -1,11 +1,12 @@
 """Results as JSON; the schema is part of the interface and described in ``docs/evaluation.md``.
 
-    {"recording", "receiver", "events", "seconds", "mev_per_s", "lost_packets", "skipped_words",
+    {"schema": 2, "recording", "receiver", "events", "seconds", "mev_per_s", "lost_packets", "skipped_words",
      "beacons": [{"track_id", "state", "confirmed_at_s", "bit_rate_bps", "text",
                   "path": [[t_s, x_px, y_px], …],
                   "characters": [{"t_s", "code", "status", "confidence"}, …],
                   "transmissions": [{"start_s", "characters", "wrong", "wrong_ok", "repaired", "inserted",
-                                     "message_accuracy", "bit_accuracy"}, …]}, …]}
+                                     "message_accuracy", "bit_accuracy"}, …]}, …],
+     "scene": null or {"beacons": […], "confirmed": {…}, "tracks": {…}, …}}
 
 One recording is one object, several are a list of them.
 """
@@ -13,15 +14,19 @@ One recording is one object, several are a list of them.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from beacon_comm.core.errors import RecordingError
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.evaluation.result import BeaconResult, RecordingResult
-from beacon_comm.evaluation.scoring import Transmission
+from beacon_comm.evaluation.scene_score import BeaconScore, Count, PositionScore, SceneScore
+from beacon_comm.evaluation.scoring import Interval, Transmission
 
+SCHEMA = 2
 # Digits behind the point that are kept: times to the ns, positions to a 10,000th of a pixel.
 TIME_DIGITS = 9
 POSITION_DIGITS = 4
@@ -30,6 +35,7 @@ POSITION_DIGITS = 4
 def result_json(result: RecordingResult) -> dict[str, Any]:
     """Return a recording's result in the schema of the module's head."""
     return {
+        'schema': SCHEMA,
         'recording': result.recording,
         'receiver': result.receiver,
         'events': result.events,
@@ -38,6 +44,7 @@ def result_json(result: RecordingResult) -> dict[str, Any]:
         'lost_packets': result.lost_packets,
         'skipped_words': result.skipped_words,
         'beacons': [_beacon(beacon) for beacon in result.beacons],
+        'scene': None if result.scene is None else _scene(result.scene),
     }
 
 
@@ -91,6 +98,68 @@ def _transmission(transmission: Transmission) -> dict[str, Any]:
         'message_accuracy': transmission.message_accuracy,
         'bit_accuracy': transmission.bit_accuracy,
     }
+
+
+def _scene(score: SceneScore) -> dict[str, Any]:
+    return {
+        'sent': _count(score.sent),
+        'confirmed': {
+            **asdict(score.confirmed),
+            'mota_interval': _interval(score.mota_interval),
+            'motp_interval_px': _interval(score.motp_interval),
+        },
+        'tracks': asdict(score.tracks),
+        'false_confirmations': list(score.false_confirmations),
+        'on_reflections': list(score.on_reflections),
+        'stray_characters': score.stray_characters,
+        'beacons': [_true_beacon(beacon) for beacon in score.beacons],
+    }
+
+
+def _true_beacon(beacon: BeaconScore) -> dict[str, Any]:
+    return {
+        'name': beacon.name,
+        'kind': beacon.kind,
+        'bit_rate_bps': beacon.bit_rate_bps,
+        'seen_s': beacon.seen_s,
+        'tracks': list(beacon.tracks),
+        'sent': _count(beacon.sent) if beacon.transmissions else None,
+        'locks': [{'begin_s': _seconds(lock.begin_ns), 'lock_s': lock.lock_s, 'lost': lock.lost} for lock in beacon.locks],
+        'confirm_s': beacon.confirm_s,
+        'position': None if beacon.position is None else _position(beacon.position),
+    }
+
+
+def _count(count: Count) -> dict[str, Any]:
+    def accuracy(share: float) -> float | None:
+        return None if math.isnan(share) else share
+
+    return {
+        **asdict(count),
+        'message_accuracy': accuracy(count.message_accuracy),
+        'message_interval': _interval(count.message_interval),
+        'bit_accuracy': accuracy(count.bit_accuracy),
+        'bit_interval': _interval(count.bit_interval),
+    }
+
+
+def _position(position: PositionScore) -> dict[str, Any]:
+    return {
+        'instants': len(position.t_ns),
+        'rms_px': position.rms_px,
+        'rms_interval_px': _interval(position.interval_px),
+        'median_px': position.median_px,
+        'p95_px': position.p95_px,
+        'speed_px_per_s': position.speed_px_per_s,
+        'lag_s': position.lag_s,
+        'nees': position.nees,
+        'nees_interval': _interval(position.nees_interval),
+        'bearing_rms_rad': position.bearing_rms_rad,
+    }
+
+
+def _interval(interval: Interval | None) -> list[float] | None:
+    return None if interval is None else [interval.low, interval.high]
 
 
 def _seconds(t_ns: int) -> float:
