@@ -57,6 +57,9 @@ def make_parser() -> argparse.ArgumentParser:
     )
     add_parameter_arguments(parser)
     parser.add_argument('--camera', metavar='YAML', help='calibration of the camera, for bearings')
+    parser.add_argument(
+        '--report', metavar='DIR', help='write a page of tables and figures there, index.html; with --receiver A,B of both'
+    )
     parser.add_argument('--json', metavar='FILE', help='write the results there, too (docs/evaluation.md)')
     parser.add_argument('--topic', help='event topic of the bags (default: the only one)')
     parser.add_argument('--start', type=float, default=0.0, metavar='S', help='seconds of each recording to leave out')
@@ -81,7 +84,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not arguments.recordings and arguments.stress is None:
         parser.error('the following arguments are required: RECORDING')
     try:
-        return _run(arguments) if arguments.stress is None else _stress(arguments)
+        if arguments.stress is not None:
+            return _stress(arguments)
+        return _run(arguments, sys.argv[1:] if argv is None else argv)
     except BeaconCommError as error:
         return _complain(str(error))
     except KeyboardInterrupt:
@@ -91,7 +96,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return EXIT_ERROR
 
 
-def _run(arguments: argparse.Namespace) -> int:
+def _run(arguments: argparse.Namespace, words: Sequence[str]) -> int:
     # Imported here: the kernels' libraries take a second, and --help and wrong arguments need none of them.
     from beacon_comm.cli.offline import Options, evaluate_recording, is_mat
     from beacon_comm.compiling.warm_up import warm_up
@@ -99,55 +104,80 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.start < 0.0 or (arguments.duration is not None and arguments.duration <= 0.0):
         raise RecordingError('--start must not be negative, --duration must be more than 0')
     _check_writable(arguments.json)
-    parameters, passed_over = parameters_from(arguments)
+    receivers = [None] if arguments.receiver is None else arguments.receiver.split(',')
+    settings: dict[str, Parameters] = {}
+    passed_over: list[str] = []
+    for receiver in receivers:
+        parameters, passed_over = parameters_from(argparse.Namespace(**{**vars(arguments), 'receiver': receiver}))
+        settings[parameters.receiver] = parameters
+    parameters = next(iter(settings.values()))
+    folder = None if arguments.report is None else _report_folder(arguments.report)
     if passed_over:
         print(f"{NAME}: {arguments.params}: not the receiver's, passed over: {', '.join(passed_over)}", file=sys.stderr)
-    options = Options(
-        parameters,
-        _truth(arguments.truth, parameters),
-        _camera(arguments.camera),
-        arguments.topic,
-        arguments.start,
-        arguments.duration,
-        arguments.truth != NO_TRUTH,
-    )
-    warm_up(parameters, pixels=not all(map(is_mat, arguments.recordings)))
-    results: list[RecordingResult] = []
+    truth, camera = _truth(arguments.truth, parameters), _camera(arguments.camera)
+    options = {
+        receiver: Options(
+            own, truth, camera, arguments.topic, arguments.start, arguments.duration, arguments.truth != NO_TRUTH
+        )
+        for receiver, own in settings.items()
+    }
+    for own in settings.values():
+        warm_up(own, pixels=not all(map(is_mat, arguments.recordings)))
+    groups: list[list[RecordingResult]] = []
     code = EXIT_OK
     for recording in arguments.recordings:
         try:
-            result = evaluate_recording(recording, options)
+            groups.append([evaluate_recording(recording, own) for own in options.values()])
         except BeaconCommError as error:
             code = _complain(str(error))
             continue
-        results.append(result)
-        if result.problem is not None:
-            code = _complain(result.problem)
+        problem = groups[-1][0].problem
+        if problem is not None:
+            code = _complain(problem)
+    results = [result for group in groups for result in group]
     if results:
-        whole = arguments.start == 0.0 and arguments.duration is None
-        print_results(results, options.truth is not None, whole and arguments.truth == 'sonnet18')
+        comparable = arguments.start == 0.0 and arguments.duration is None and arguments.truth == 'sonnet18'
+        print_results(results, truth is not None, comparable)
         if arguments.json is not None:
             write_json(arguments.json, results)
+        if folder is not None:
+            from beacon_comm.cli.report_page import write_report  # loads the drawing
+
+            path = write_report(folder, groups, options, shlex.join([NAME, *words]), comparable)
+            print(f'{NAME}: wrote {path}', file=sys.stderr)
     return code
+
+
+def _report_folder(name: str) -> Path:
+    """Make the report's folder before anything is evaluated."""
+    from beacon_comm.evaluation.stress_report import require_matplotlib
+
+    require_matplotlib()
+    return _writable_folder('--report', name)
+
+
+def _writable_folder(option: str, name: str) -> Path:
+    folder = Path(name)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RecordingError(f'{option} {folder}: cannot be made ({error.strerror})') from error
+    if not os.access(folder, os.W_OK):
+        raise RecordingError(f'{option} {folder}: cannot be written (no permission)')
+    return folder
 
 
 def _stress(arguments: argparse.Namespace) -> int:
     """Measure every receiver under stress; write the tables and figures, and print the summary."""
     from beacon_comm.evaluation.stress_report import require_matplotlib, summary_table, write_report
 
-    for name, unused in (('camera', None), ('json', None), ('topic', None), ('start', 0.0), ('duration', None)):
-        if getattr(arguments, name) != unused:
+    for name in ('camera', 'json', 'report', 'topic', 'start', 'duration'):
+        if getattr(arguments, name) != (0.0 if name == 'start' else None):
             raise RecordingError(f'--{name} and --stress do not go together')
     parameters, _ = parameters_from(arguments)
     simulated_bps = _simulated_rates(arguments.stress_simulated, parameters)
     truth = _truth(arguments.truth or 'sonnet18', parameters) or ''
-    folder = Path(arguments.stress)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RecordingError(f'--stress {folder}: cannot be made ({error.strerror})') from error
-    if not os.access(folder, os.W_OK):
-        raise RecordingError(f'--stress {folder}: cannot be written (no permission)')
+    folder = _writable_folder('--stress', arguments.stress)
     require_matplotlib()
     from beacon_comm.cli.stress import SIMULATED_BPS, default_recordings, run_stress  # loads the kernels
 

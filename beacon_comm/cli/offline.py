@@ -119,6 +119,7 @@ def _evaluate_mat(path: str, options: Options) -> RecordingResult:
         skipped_words=0,
         beacons=(beacon,),
         silent_tracks=0,
+        truth=options.truth,
     )
 
 
@@ -186,6 +187,7 @@ def _evaluate_bag(path: str, pieces: BagPieces, options: Options, scene: SceneTr
         width=size[0],
         height=size[1],
         silent=silent,
+        truth=options.truth,
     )
 
 

@@ -72,6 +72,18 @@ class HighPassFilter:
         self._times = np.array([_LONG_AGO_NS, _LONG_AGO_NS, 1], np.int64)
         self._values = np.zeros(3)
 
+    @property
+    def filtered(self) -> float:
+        """The filtered signal L (events) just after the newest event."""
+        return float(self._values[_FILTERED])
+
+    @property
+    def levels(self) -> tuple[float, float]:
+        """The low and the high level (events) that L is compared with now."""
+        amplitude = 0.5 * (self._values[_PEAK] + self._values[_TROUGH])
+        high, low = np.maximum(self._shares * amplitude, self._least)
+        return -float(low), float(high)
+
     def push(self, t_ns: NDArray[np.int64], polarity: NDArray[np.int8]) -> Edges:
         """Take the next events and return the edges they cause.
 

@@ -13,22 +13,23 @@ from beacon_comm.evaluation.scene_score import PositionScore
 from beacon_comm.evaluation.scoring import Interval, Transmission
 
 SCORE_COLUMNS = (
-    'recording', 'track', 'start', 'bit/s', 'characters', 'wrong', 'missing', 'inserted', 'wrong ok', 'repaired',
+    'recording', 'receiver', 'track', 'start', 'bit/s', 'characters', 'wrong', 'missing', 'inserted', 'wrong ok', 'repaired',
     'message accuracy', 'bit accuracy',
 )  # fmt: skip
-TEXT_COLUMNS = ('recording', 'track', 'state', 'bit/s', 'confirmed', 'bearing', 'characters', 'ok', 'end of text')
+PUBLISHED_COLUMNS = ('recording', 'receiver', 'paper: message', 'ours: message', 'right', 'paper: bits', 'ours: bits')
+TEXT_COLUMNS = ('recording', 'receiver', 'track', 'state', 'bit/s', 'confirmed', 'bearing', 'characters', 'ok', 'end of text')
 RECORDING_COLUMNS = (
-    'recording', 'events', 'seconds', 'Mev/s', 'lost packets', 'skipped words', 'beacons', 'other tracks',
+    'recording', 'receiver', 'events', 'seconds', 'Mev/s', 'lost packets', 'skipped words', 'beacons', 'other tracks',
 )  # fmt: skip
 BEACON_COLUMNS = (
-    'recording', 'beacon', 'bit/s', 'tracks', 'characters', 'wrong', 'wrong ok', 'message accuracy', 'bit accuracy',
+    'recording', 'receiver', 'beacon', 'bit/s', 'tracks', 'characters', 'wrong', 'wrong ok', 'message accuracy', 'bit accuracy',
     'locked', 'confirmed', 'px/s', 'error rms', 'p95', 'lag', 'NEES',
 )  # fmt: skip
 TRACKING_COLUMNS = (
-    'recording', 'reports', 'MOTA', 'MOTP', 'IDF1', 'HOTA', 'ID switches', 'swaps', 'fragmentations', 'missed',
+    'recording', 'receiver', 'reports', 'MOTA', 'MOTP', 'IDF1', 'HOTA', 'ID switches', 'swaps', 'fragmentations', 'missed',
     'false positives', 'false confirmations',
 )  # fmt: skip
-LEFT = ('recording', 'beacon', 'reports', 'state', 'end of text')
+LEFT = ('recording', 'receiver', 'beacon', 'reports', 'state', 'end of text')
 # Characters of a text that a table shows.
 SHOWN_TEXT = 48
 
@@ -51,7 +52,8 @@ PUBLISHED = {
 
 
 def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table with aligned columns; numbers and all but the first column stand right, texts left."""
+    """Return a table with aligned columns, numbers right, texts left; the receiver's only where there are several."""
+    columns, rows = without_sole_receiver(columns, rows)
     cells = [tuple(columns), *(tuple(row) for row in rows)]
     widths = [max(len(row[column]) for row in cells) for column in range(len(columns))]
     left = {column for column, name in enumerate(columns) if name in LEFT}
@@ -66,33 +68,52 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return '\n'.join(lines)
 
 
+def without_sole_receiver(
+    columns: Sequence[str], rows: Sequence[Sequence[str]]
+) -> tuple[Sequence[str], Sequence[Sequence[str]]]:
+    """Leave out the column of the receivers where all rows have the same."""
+    if 'receiver' not in columns or len({row[columns.index('receiver')] for row in rows}) > 1:
+        return columns, rows
+    kept = [n for n, name in enumerate(columns) if name != 'receiver']
+    return [columns[n] for n in kept], [[row[n] for n in kept] for row in rows]
+
+
 def recordings_table(results: Sequence[RecordingResult]) -> str:
     """Return one row a recording: size, speed, losses, number of beacons."""
-    return table(
-        RECORDING_COLUMNS,
-        [
-            (
-                _name(result),
-                f'{result.events:,}',
-                f'{result.duration_ns / NS_PER_S:.3f}',
-                f'{result.mev_per_s:.2f}',
-                str(result.lost_packets),
-                str(result.skipped_words),
-                str(sum(beacon.confirmed_at_ns is not None for beacon in result.beacons)),
-                str(result.silent_tracks + sum(beacon.confirmed_at_ns is None for beacon in result.beacons)),
-            )
-            for result in results
-        ],
-    )
+    return table(RECORDING_COLUMNS, recording_rows(results))
+
+
+def recording_rows(results: Sequence[RecordingResult]) -> list[tuple[str, ...]]:
+    """Return the rows of :func:`recordings_table`."""
+    return [
+        (
+            name_of(result),
+            result.receiver,
+            f'{result.events:,}',
+            f'{result.duration_ns / NS_PER_S:.3f}',
+            f'{result.mev_per_s:.2f}',
+            str(result.lost_packets),
+            str(result.skipped_words),
+            str(sum(beacon.confirmed_at_ns is not None for beacon in result.beacons)),
+            str(result.silent_tracks + sum(beacon.confirmed_at_ns is None for beacon in result.beacons)),
+        )
+        for result in results
+    ]
 
 
 def scores_table(results: Sequence[RecordingResult]) -> str:
     """Return one row a transmission: its fitted start and rate, counts, accuracies with 95 % confidence intervals."""
-    rows = []
-    for result in results:
-        for beacon in result.beacons:
-            rows += [_score_row(result, beacon, transmission) for transmission in beacon.transmissions]
-    return table(SCORE_COLUMNS, rows)
+    return table(SCORE_COLUMNS, score_rows(results))
+
+
+def score_rows(results: Sequence[RecordingResult]) -> list[tuple[str, ...]]:
+    """Return the rows of :func:`scores_table`."""
+    return [
+        _score_row(result, beacon, transmission)
+        for result in results
+        for beacon in result.beacons
+        for transmission in beacon.transmissions
+    ]
 
 
 def beacons_table(results: Sequence[RecordingResult]) -> str:
@@ -109,7 +130,8 @@ def beacon_rows(results: Sequence[RecordingResult]) -> list[tuple[str, ...]]:
             known = bool(beacon.transmissions)
             rows.append(
                 (
-                    _name(result),
+                    name_of(result),
+                    result.receiver,
                     beacon.name,
                     '-' if beacon.bit_rate_bps is None else f'{beacon.bit_rate_bps:g}',
                     ', '.join(map(str, beacon.tracks)) or 'none',
@@ -143,7 +165,8 @@ def tracking_rows(results: Sequence[RecordingResult]) -> list[tuple[str, ...]]:
             mota, motp = (scene.mota_interval, scene.motp_interval) if of_confirmed else (None, None)
             rows.append(
                 (
-                    _name(result),
+                    name_of(result),
+                    result.receiver,
                     name,
                     '-' if score.mota is None else _share(score.mota, mota, 3),
                     '-' if score.motp_px is None else _share(score.motp_px, motp, 2) + ' px',
@@ -177,14 +200,20 @@ def _milliseconds(value_s: float | None, digits: int = 0) -> str:
 
 def texts_table(results: Sequence[RecordingResult]) -> str:
     """Return one row a listed beacon: state, bearing and the end of its text."""
-    rows = []
+    return table(TEXT_COLUMNS, text_rows(results))
+
+
+def text_rows(results: Sequence[RecordingResult]) -> list[tuple[str, ...]]:
+    """Return the rows of :func:`texts_table`."""
+    rows: list[tuple[str, ...]] = []
     for result in results:
         for beacon in listed(result):
             ok = sum(character.status.name == 'OK' for character in beacon.characters)
             shown = repr(beacon.text[-SHOWN_TEXT:])[1:-1]
             rows.append(
                 (
-                    _name(result),
+                    name_of(result),
+                    result.receiver,
                     str(beacon.track_id),
                     beacon.state.name.lower(),
                     '-' if beacon.bit_rate_bps is None else f'{beacon.bit_rate_bps:g}',
@@ -195,7 +224,7 @@ def texts_table(results: Sequence[RecordingResult]) -> str:
                     shown,
                 )
             )
-    return table(TEXT_COLUMNS, rows)
+    return rows
 
 
 def listed(result: RecordingResult) -> tuple[BeaconResult, ...]:
@@ -210,7 +239,13 @@ def published_table(results: Sequence[RecordingResult]) -> str | None:
 
     The paper counts one sonnet a recording, the second one, whose start it detects: so the last transmission.
     """
-    rows = []
+    rows = published_rows(results)
+    return table(PUBLISHED_COLUMNS, rows) if rows else None
+
+
+def published_rows(results: Sequence[RecordingResult]) -> list[tuple[str, ...]]:
+    """Return the rows of :func:`published_table`."""
+    rows: list[tuple[str, ...]] = []
     for result in results:
         paper = PUBLISHED.get(PurePath(result.recording).stem)
         transmissions = [transmission for beacon in result.beacons for transmission in beacon.transmissions]
@@ -221,6 +256,7 @@ def published_table(results: Sequence[RecordingResult]) -> str | None:
         rows.append(
             (
                 PurePath(result.recording).stem,
+                result.receiver,
                 f'{paper.message_accuracy:.3f}',
                 f'{ours.message_accuracy:.3f}',
                 f'{right} of {ours.characters}',
@@ -228,18 +264,18 @@ def published_table(results: Sequence[RecordingResult]) -> str | None:
                 f'{ours.bit_accuracy:.4f}',
             )
         )
-    if not rows:
-        return None
-    return table(('recording', 'paper: message', 'ours: message', 'right', 'paper: bits', 'ours: bits'), rows)
+    return rows
 
 
-def _name(result: RecordingResult) -> str:
+def name_of(result: RecordingResult) -> str:
+    """Return a recording's name for tables."""
     return PurePath(result.recording).name or result.recording
 
 
 def _score_row(result: RecordingResult, beacon: BeaconResult, transmission: Transmission) -> tuple[str, ...]:
     return (
-        _name(result),
+        name_of(result),
+        result.receiver,
         str(beacon.track_id),
         'not found' if transmission.start_ns is None else f'{transmission.start_ns / NS_PER_S:.3f} s',
         '-' if transmission.bit_rate_bps is None else f'{transmission.bit_rate_bps:.2f}',

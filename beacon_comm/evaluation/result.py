@@ -93,7 +93,8 @@ class RecordingResult:
         problem: what could not be read, None if all could.
         scene: scores against the scene's truth, None where there is none beside the recording.
         width, height: sensor size (px), None for a recording without pixels.
-        silent: the other tracks, kept where there is a scene's truth.
+        silent: the other tracks.
+        truth: the text that the transmissions were compared with, None without one.
     """
 
     recording: str
@@ -110,6 +111,7 @@ class RecordingResult:
     width: int | None = None
     height: int | None = None
     silent: tuple[BeaconResult, ...] = ()
+    truth: str | None = None
 
     @property
     def mev_per_s(self) -> float:
