@@ -36,6 +36,7 @@ class Path:
     vx_px_per_s: float = 0.0
     hidden_ns: tuple[int, int] = (0, 0)
     radius: float = 4.0
+    characters_ns: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
     sendings_ns: NDArray[np.int64] = field(default_factory=lambda: SHIFT_NS + np.array([100_000_000, 700_000_000]))
 
     def centre(self, t_ns):
@@ -134,6 +135,17 @@ def test_what_was_hidden_was_not_to_be_read() -> None:
     # Of the characters in sight, those due at 310, 320 and 330 ms were decoded from the third on.
     assert (one.sent.missing, one.locks[1].lost, one.locks[1].begin_ns) == (2, 2, 310_000_000)
     assert one.locks[1].lock_s == pytest.approx(0.06)
+
+
+def test_what_was_cut_was_not_sent() -> None:
+    """The first sending is broken off after 12 characters: the rest of the time the line is idle."""
+    whole = Path()
+    first, second = whole.sendings_ns
+    starts_ns = np.concatenate((first + np.arange(12) * CHARACTER_NS, second + np.arange(len(TEXT)) * CHARACTER_NS))
+    beacon = replace(whole, characters_ns=starts_ns)
+    seen = sent(whole)[:12] + sent(whole)[len(TEXT) :]
+    (one,) = scored([track(beacon, 1, seen)], [beacon]).beacons
+    assert (one.sent.characters, one.sent.wrong) == (12 + len(TEXT), 0)
 
 
 def test_position_lag_and_consistency() -> None:

@@ -40,6 +40,10 @@ class IgnoredBlob:
     def sendings_ns(self) -> NDArray[np.int64]:
         return np.empty(0, np.int64)
 
+    @property
+    def characters_ns(self) -> NDArray[np.int64]:
+        return np.empty(0, np.int64)
+
     def centre(self, t_ns: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         return self.blob.trajectory.at(t_ns)
 

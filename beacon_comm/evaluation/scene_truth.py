@@ -3,8 +3,8 @@
     scene time      0 ──── start ─── first event ────────────── end        paths, sendings (ns, the simulator's clock)
     recording time             ┆          0 ───────────────── end          = scene time - shift: results (ns)
 
-Characters of a sending that were hidden, or lie outside the recording, were not to be read: a sending falls into *runs* of
-whole characters in sight.
+Characters of a sending that was cut, that were hidden, or lie outside the recording, were not to be read: a sending falls
+into *runs* of whole characters in sight.
 """
 
 from __future__ import annotations
@@ -43,6 +43,8 @@ class TrueBeacon(Protocol):
     def bit_rate_bps(self) -> float | None: ...
     @property
     def sendings_ns(self) -> Ints: ...
+    @property
+    def characters_ns(self) -> Ints: ...
     def centre(self, t_ns: ArrayLike, /) -> tuple[Floats, Floats]: ...
     def visible(self, t_ns: ArrayLike, /) -> NDArray[np.bool_]: ...
     def radius_px(self, t_ns: ArrayLike, /) -> Floats: ...
@@ -98,9 +100,14 @@ def runs_in_sight(beacon: TrueBeacon, sight: Sight, shift_ns: int, frame: Charac
     character_ns = frame.duration_ns(beacon.bit_rate_bps)
     blank = not_found(beacon.text, frame)
     runs = []
-    for start_ns in (int(t) - shift_ns for t in beacon.sendings_ns):
+    # How many characters of each sending were sent at all; all of them where that is not told.
+    ends_ns = np.append(beacon.sendings_ns[1:], np.iinfo(np.int64).max)
+    counts = np.diff(np.searchsorted(beacon.characters_ns, (beacon.sendings_ns, ends_ns)), axis=0)[0]
+    for start_ns, count in zip((int(t) - shift_ns for t in beacon.sendings_ns), counts, strict=True):
         due_ns: Floats = start_ns + np.arange(len(beacon.text)) * np.float64(character_ns)
         whole = sight.throughout(due_ns, due_ns + character_ns)
+        if len(beacon.characters_ns):
+            whole[count:] = False
         change = np.diff(np.concatenate(([0], whole.astype(np.int8), [0])))
         for first, stop in zip(np.flatnonzero(change == 1), np.flatnonzero(change == -1), strict=True):
             runs.append(
