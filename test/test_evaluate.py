@@ -89,7 +89,8 @@ def check_schema(result: object, receiver: str = 'sequence') -> None:
 def check_scene(scene: dict) -> None:
     """Check every key of a scene's scores."""
     assert list(scene) == [
-        'sent', 'confirmed', 'tracks', 'false_confirmations', 'on_reflections', 'stray_characters', 'beacons',
+        'sent', 'confirmed', 'tracks', 'false_confirmations', 'on_reflections', 'stray_characters',
+        'double_characters', 'beacons',
     ]  # fmt: skip
     tracking = [
         'objects', 'reports', 'matches', 'misses', 'false_positives', 'id_switches', 'fragmentations', 'swaps',
@@ -432,7 +433,8 @@ def test_the_document_names_every_key() -> None:
         'recording receiver events seconds mev_per_s lost_packets skipped_words beacons track_id state confirmed_at_s'
         ' bit_rate_bps text path characters transmissions t_s code status confidence start_s wrong wrong_ok repaired'
         ' inserted message_accuracy bit_accuracy schema scene sent confirmed tracks false_confirmations on_reflections'
-        ' stray_characters objects reports matches misses false_positives id_switches fragmentations swaps mostly_tracked'
+        ' stray_characters double_characters'
+        ' objects reports matches misses false_positives id_switches fragmentations swaps mostly_tracked'
         ' partly_tracked mostly_lost mota motp_px idf1 id_precision id_recall hota detection_accuracy association_accuracy'
         ' mota_interval motp_interval_px message_interval bit_interval bits wrong_bits missing name kind seen_s locks begin_s'
         ' lock_s lost confirm_s position instants rms_px rms_interval_px median_px p95_px speed_px_per_s lag_s nees'

@@ -184,6 +184,16 @@ def test_a_confirmed_track_on_nothing_is_false() -> None:
     assert score.beacons[0].sent.wrong == 0
 
 
+def test_what_a_second_track_reads_once_more_counts_once() -> None:
+    """The second track also reads what the first one, begun late, has not."""
+    beacon = Path()
+    characters = sent(beacon)
+    late, twice = characters[4:], characters[:10]
+    score = scored([track(beacon, 1, twice, None), track(beacon, 2, late)], [beacon])
+    assert (score.beacons[0].sent.wrong, score.double_characters, score.stray_characters) == (0, 6, 0)
+    assert len(score.beacons[0].characters) == len(characters)
+
+
 def test_a_candidate_on_nothing_is_not() -> None:
     beacon = Path()
     score = scored([track(beacon, 1, sent(beacon)), track(replace(beacon, x_px=300.0), 2, (), None)], [beacon])

@@ -112,6 +112,7 @@ def _scene(score: SceneScore) -> dict[str, Any]:
         'false_confirmations': list(score.false_confirmations),
         'on_reflections': list(score.on_reflections),
         'stray_characters': score.stray_characters,
+        'double_characters': score.double_characters,
         'beacons': [_true_beacon(beacon) for beacon in score.beacons],
     }
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -177,6 +177,7 @@ class SceneScore:
         false_confirmations: labels of tracks that were on no beacon when they were confirmed.
         on_reflections: labels of tracks that were on a reflection then.
         stray_characters: decoded by tracks on no beacon.
+        double_characters: decoded by a second track on a beacon, where another one had read it already; not counted.
     """
 
     beacons: tuple[BeaconScore, ...]
@@ -187,6 +188,7 @@ class SceneScore:
     false_confirmations: tuple[int, ...]
     on_reflections: tuple[int, ...]
     stray_characters: int
+    double_characters: int
 
     @property
     def sent(self) -> Count:
@@ -259,7 +261,7 @@ def score_scene(
     matches = match(claimed)
     labels = np.array([track.track_id for track in tracks], np.int64)[ever]
     claimed_points = [points[m] for m in np.flatnonzero(ever)]
-    owned, stray = _characters_of(tracks, truth)
+    owned, stray, doubles = _characters_of(tracks, truth, frame)
     false, on_reflections, confirmed_ns = _confirmations(tracks, truth)
     scores = [
         _beacon_score(
@@ -285,6 +287,7 @@ def score_scene(
         false,
         on_reflections,
         stray,
+        doubles,
     )
 
 
@@ -334,12 +337,43 @@ def _at(track: BeaconResult, t_ns: Ints) -> tuple[Floats, Floats]:
 
 
 Received = tuple[Character, int]
+# A second track's character is another one if it is this far from all of the first's (characters).
+ANOTHER = 0.75
 
 
-def _characters_of(tracks: Sequence[BeaconResult], truth: _Truth) -> tuple[list[list[Received]], int]:
-    """Return each beacon's characters with the times they were given out at, and how many are no beacon's."""
-    owned: list[list[Received]] = [[] for _ in truth.beacons]
-    stray = 0
+def primary(tracks: Sequence[BeaconResult], frame: CharacterFrame) -> tuple[list[Received], int]:
+    """Return what one beacon's tracks read, with the times it was given out at, each character once; and the number of doubles.
+
+    The track with most characters goes first; of the others counts what lies where there is nothing yet.
+    """
+    kept: list[Received] = []
+    doubles = 0
+    for track in sorted(tracks, key=lambda one: -len(one.characters)):
+        times = np.sort(np.array([character.t_ns for character, _ in kept], np.float64))
+        received_ns = track.received_ns or tuple(character.t_ns for character in track.characters)
+        for character, received in zip(track.characters, received_ns, strict=True):
+            apart_ns = ANOTHER * frame.duration_ns(character.bit_rate_bps)
+            place = int(np.searchsorted(times, character.t_ns))
+            near = times[max(0, place - 1) : place + 1]
+            if len(near) and np.abs(near - character.t_ns).min() < apart_ns:
+                doubles += 1
+            else:
+                kept.append((character, received))
+    kept.sort(key=lambda received: received[0].t_ns)
+    return kept, doubles
+
+
+def primary_characters(tracks: Sequence[BeaconResult], frame: CharacterFrame) -> list[Character]:
+    """Return the characters of :func:`primary`, in order of time."""
+    return [character for character, _ in primary(tracks, frame)[0]]
+
+
+def _characters_of(
+    tracks: Sequence[BeaconResult], truth: _Truth, frame: CharacterFrame
+) -> tuple[list[list[Received]], int, int]:
+    """Return each beacon's characters with the times they were given out at, how many are no beacon's, and how many doubles."""
+    parts: list[list[BeaconResult]] = [[] for _ in truth.beacons]
+    stray = doubles = 0
     for track in tracks:
         if not track.characters or not track.path:
             continue
@@ -347,15 +381,17 @@ def _characters_of(tracks: Sequence[BeaconResult], truth: _Truth) -> tuple[list[
         # A track's path begins where it was seen first; what was read back before that was there, too.
         t_ns = np.maximum(t_ns, track.path[0].t_ns)
         on = truth.nearest(*_at(track, t_ns), t_ns, CHARACTER_GATES)
-        received_ns = track.received_ns or tuple(character.t_ns for character in track.characters)
-        for b, character, received in zip(on, track.characters, received_ns, strict=True):
-            if b < 0:
-                stray += 1
-            else:
-                owned[b].append((character, received))
-    for one in owned:
-        one.sort(key=lambda received: received[0].t_ns)
-    return owned, stray
+        stray += int(np.count_nonzero(on < 0))
+        for b in np.unique(on[on >= 0]):
+            own = np.flatnonzero(on == b)
+            received_ns = tuple(track.received_ns[n] for n in own) if track.received_ns else ()
+            parts[b].append(replace(track, characters=tuple(track.characters[n] for n in own), received_ns=received_ns))
+    owned = []
+    for part in parts:
+        received, twice = primary(part, frame)
+        owned.append(received)
+        doubles += twice
+    return owned, stray, doubles
 
 
 def _confirmations(

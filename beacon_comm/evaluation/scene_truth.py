@@ -101,7 +101,7 @@ def runs_in_sight(beacon: TrueBeacon, sight: Sight, shift_ns: int, frame: Charac
     blank = not_found(beacon.text, frame)
     runs = []
     # How many characters of each sending were sent at all; all of them where that is not told.
-    ends_ns = np.append(beacon.sendings_ns[1:], np.iinfo(np.int64).max)
+    ends_ns = np.append(beacon.sendings_ns[1:], np.iinfo(np.int64).max)[: len(beacon.sendings_ns)]
     counts = np.diff(np.searchsorted(beacon.characters_ns, (beacon.sendings_ns, ends_ns)), axis=0)[0]
     for start_ns, count in zip((int(t) - shift_ns for t in beacon.sendings_ns), counts, strict=True):
         due_ns: Floats = start_ns + np.arange(len(beacon.text)) * np.float64(character_ns)
