@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from beacon_comm.core.candidates import BeaconState
 from beacon_comm.core.character import Character, Status
 from beacon_comm.core.framing import CharacterFrame
-from beacon_comm.evaluation.result import BeaconResult, PathPoint
+from beacon_comm.evaluation.report import SUMMARY_COLUMNS, summary_rows
+from beacon_comm.evaluation.result import BeaconResult, PathPoint, RecordingResult
 from beacon_comm.evaluation.scene_score import SceneScore, score_scene
 from beacon_comm.evaluation.scene_truth import Sight, runs_in_sight
 
@@ -256,3 +257,22 @@ def test_an_empty_scene() -> None:
     assert (score.beacons, score.confirmed.mota, score.sent.characters) == ((), None, 0)
     (one,) = scored([], [Path()]).beacons
     assert (one.sent.missing, one.locks[0].lock_s, one.position) == (2 * len(TEXT), None, None)
+
+
+def test_scenes_are_summed_up_with_intervals_from_one_to_the_next() -> None:
+    beacon = Path()
+    results = []
+    for seed in range(6):
+        off = track(beacon, 1, sent(beacon), 100_000_000 * (seed + 1), off_px=(0.1 * seed, 0.0))
+        scene = scored([off], [beacon])
+        results.append(RecordingResult(f'{seed}', 'sequence', 1, 1, 1.0, 0, 0, (off,), 0, scene=scene))
+    (row,) = summary_rows(results)
+    cells = dict(zip(SUMMARY_COLUMNS, row, strict=True))
+    assert (cells['scenes'], cells['beacons'], cells['characters']) == ('6', '6 of 6', str(6 * 2 * len(TEXT)))
+    assert cells['message accuracy'].startswith('1.000 [0.99')
+    assert cells['confirmed'].startswith('250 [')  # the mean of 0, 100 … 500 ms
+    assert cells['error rms'].startswith('0.29 [')  # of 0, 0.1 … 0.5 px over 1.9, 1.8 … 1.4 s
+    assert cells['NEES'] == '-'
+    assert summary_rows(results[:1]) == []
+    (row,) = summary_rows(results[:2])
+    assert '[' not in dict(zip(SUMMARY_COLUMNS, row, strict=True))['MOTA']  # two are too few to tell

@@ -22,6 +22,7 @@ from beacon_comm.evaluation.report import (
     published_table,
     recordings_table,
     scores_table,
+    summary_table,
     texts_table,
     tracking_table,
 )
@@ -239,6 +240,9 @@ def print_results(results: Sequence[RecordingResult], scored: bool, comparable: 
     if any(result.scene is not None for result in results):
         print('\nAgainst the truth beside the bag, brackets are 95 % intervals:\n' + beacons_table(results))
         print('\n' + tracking_table(results))
+        summary = summary_table(results)
+        if summary is not None:
+            print('\nAll scenes, means and their intervals from scene to scene:\n' + summary)
     if scored and any(beacon.transmissions for result in results for beacon in result.beacons):
         print('\n' + scores_table(results))
         published = published_table(results) if comparable else None

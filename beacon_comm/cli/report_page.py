@@ -33,6 +33,7 @@ from beacon_comm.evaluation.report import (
     PUBLISHED_COLUMNS,
     RECORDING_COLUMNS,
     SCORE_COLUMNS,
+    SUMMARY_COLUMNS,
     TEXT_COLUMNS,
     TRACKING_COLUMNS,
     beacon_rows,
@@ -40,6 +41,7 @@ from beacon_comm.evaluation.report import (
     published_rows,
     recording_rows,
     score_rows,
+    summary_rows,
     text_rows,
     tracking_rows,
 )
@@ -111,6 +113,13 @@ def _page(
             ' finds, beacon or not; its false positives are other blobs.',
             note=True,
         )
+        summary = summary_rows(results)
+        if summary:
+            page.heading('All scenes together')
+            page.table(SUMMARY_COLUMNS, summary)
+            page.paragraph(
+                'Means over the scenes; from five on with their interval from scene to scene, so from seed to seed.', note=True
+            )
     if any(beacon.transmissions for result in results for beacon in result.beacons):
         page.heading('Transmissions')
         page.table(SCORE_COLUMNS, score_rows(results))

@@ -39,7 +39,7 @@ def signal_figure(view: SignalView, frame: CharacterFrame) -> Figure:
     The paper's Figures 1 and 6: the first row the filtered signal between the high (red) and the low level (blue), the second
     the binarised one.
     """
-    ratios = {name: read for name, read in view.read.items() if any(one.bit_llr for one in read)}
+    ratios = {name: read for name, read in view.read.items() if any(any(one.bit_llr) for one in read)}
     heights = [2.6, 1.3, 0.7, *(1.5 for _ in ratios), *(0.8 for _ in view.read), *([0.55] if view.sent else [])]
     figure = new_figure(10.5, 0.55 + 0.72 * sum(heights))
     panels: list[Axes] = list(figure.subplots(len(heights), 1, sharex=True, height_ratios=heights, squeeze=False)[:, 0])

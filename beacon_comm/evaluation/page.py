@@ -44,7 +44,7 @@ pre { background: var(--shade); padding: .8rem 1rem; border-radius: 8px; overflo
   overflow-wrap: anywhere; }
 nav { margin: 1rem 0 0; display: flex; flex-wrap: wrap; gap: .3rem 1.2rem; }
 a { color: var(--accent); text-decoration: none; } a:hover { text-decoration: underline; }
-.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(11rem, 1fr)); gap: .8rem; margin: 1.6rem 0 .6rem; }
+.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(9.2rem, 1fr)); gap: .8rem; margin: 1.6rem 0 .6rem; }
 .tile { background: var(--card); border: 1px solid var(--line); border-radius: 10px; padding: .8rem 1rem; }
 .tile b { display: block; font-size: 1.55rem; line-height: 1.25; font-variant-numeric: tabular-nums; }
 .tile span { color: var(--muted); font-size: .86rem; }
@@ -55,7 +55,9 @@ table { border-collapse: collapse; width: 100%; font-size: .82rem; font-variant-
 th, td { padding: .4rem .6rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
 tr:last-child td { border-bottom: 0; }
 th { color: var(--muted); font-weight: 600; } th.left, td.left { text-align: left; }
-td .interval { color: var(--muted); font-size: .92em; }
+td .interval { display: block; color: var(--muted); font-size: .9em; }
+th:first-child, td:first-child { position: sticky; left: 0; background: var(--card); }
+th { vertical-align: bottom; } td { vertical-align: top; }
 figure { margin: 1.2rem 0 1.8rem; background: var(--card); border: 1px solid var(--line); border-radius: 10px;
   padding: 1rem 1rem .8rem; }
 figure .drawing { overflow-x: auto; } figure svg { display: block; width: 100%; min-width: 560px;

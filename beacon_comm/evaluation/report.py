@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import PurePath
 
+import numpy as np
+
 from beacon_comm.core.events import NS_PER_S
+from beacon_comm.evaluation.intervals import bootstrap_interval, mean_interval
 from beacon_comm.evaluation.result import BeaconResult, RecordingResult
-from beacon_comm.evaluation.scene_score import PositionScore
+from beacon_comm.evaluation.scene_score import BeaconScore, Count, PositionScore, SceneScore
 from beacon_comm.evaluation.scoring import Interval, Transmission
 
 SCORE_COLUMNS = (
@@ -28,6 +31,10 @@ BEACON_COLUMNS = (
 TRACKING_COLUMNS = (
     'recording', 'receiver', 'reports', 'MOTA', 'MOTP', 'IDF1', 'HOTA', 'ID switches', 'swaps', 'fragmentations', 'missed',
     'false positives', 'false confirmations',
+)  # fmt: skip
+SUMMARY_COLUMNS = (
+    'receiver', 'scenes', 'beacons', 'characters', 'message accuracy', 'bit accuracy', 'MOTA', 'MOTP', 'IDF1', 'HOTA', 'swaps',
+    'false confirmations', 'locked', 'confirmed', 'error rms', 'NEES',
 )  # fmt: skip
 LEFT = ('recording', 'receiver', 'beacon', 'reports', 'state', 'end of text')
 # Characters of a text that a table shows.
@@ -146,6 +153,84 @@ def beacon_rows(results: Sequence[RecordingResult]) -> list[tuple[str, ...]]:
                 )
             )
     return rows
+
+
+def summary_table(results: Sequence[RecordingResult]) -> str | None:
+    """Return one row a receiver over all scenes, None with less than two; intervals are from scene to scene."""
+    rows = summary_rows(results)
+    return table(SUMMARY_COLUMNS, rows) if rows else None
+
+
+def summary_rows(results: Sequence[RecordingResult]) -> list[tuple[str, ...]]:
+    """Return the rows of :func:`summary_table`; none with less than two scenes."""
+    rows: list[tuple[str, ...]] = []
+    for receiver in dict.fromkeys(result.receiver for result in results):
+        scenes = [result.scene for result in results if result.receiver == receiver and result.scene is not None]
+        if len(scenes) < 2:
+            continue
+        beacons = [beacon for scene in scenes for beacon in scene.beacons]
+        sent = Count.of([one for beacon in beacons for one in beacon.transmissions])
+        known = sent.characters > 0
+        rows.append(
+            (
+                receiver,
+                str(len(scenes)),
+                f'{sum(bool(beacon.tracks) for beacon in beacons)} of {len(beacons)}',
+                str(sent.characters) if known else '-',
+                _share(sent.message_accuracy, sent.message_interval, 3) if known else '-',
+                _share(sent.bit_accuracy, sent.bit_interval, 4) if known else '-',
+                _mean([scene.confirmed.mota for scene in scenes], 3),
+                _mean([scene.confirmed.motp_px for scene in scenes], 2, ' px'),
+                _mean([scene.confirmed.idf1 for scene in scenes], 3),
+                _mean([scene.confirmed.hota for scene in scenes], 3),
+                str(sum(scene.confirmed.swaps for scene in scenes)),
+                str(sum(len(scene.false_confirmations) for scene in scenes)),
+                _mean([_of_beacons(scene, _first_lock_ms) for scene in scenes], 0, ' ms'),
+                _mean([_of_beacons(scene, _confirm_ms) for scene in scenes], 0, ' ms'),
+                _rms(scenes),
+                _mean([_of_beacons(scene, _nees) for scene in scenes], 2),
+            )
+        )
+    return rows
+
+
+def _first_lock_ms(beacon: BeaconScore) -> float | None:
+    lock_s = beacon.locks[0].lock_s if beacon.locks else None
+    return None if lock_s is None else 1e3 * lock_s
+
+
+def _confirm_ms(beacon: BeaconScore) -> float | None:
+    return None if beacon.confirm_s is None else 1e3 * beacon.confirm_s
+
+
+def _nees(beacon: BeaconScore) -> float | None:
+    return None if beacon.position is None else beacon.position.nees
+
+
+def _of_beacons(scene: SceneScore, value_of: Callable[[BeaconScore], float | None]) -> float | None:
+    """Return the mean over a scene's beacons, None where none has a value."""
+    values = [value for beacon in scene.beacons if (value := value_of(beacon)) is not None]
+    return float(np.mean(values)) if values else None
+
+
+def _mean(values: Sequence[float | None], digits: int, unit: str = '') -> str:
+    """Return the mean over scenes, with its interval from five scenes on."""
+    found = np.array([value for value in values if value is not None], np.float64)
+    return _share(float(found.mean()), mean_interval(found), digits) + unit if len(found) else '-'
+
+
+def _rms(scenes: Sequence[SceneScore]) -> str:
+    squares = [
+        [float(np.sum(beacon.position.error_px**2)), float(len(beacon.position.t_ns))]
+        for scene in scenes
+        for beacon in scene.beacons
+        if beacon.position is not None
+    ]
+    if not squares:
+        return '-'
+    blocks = np.array(squares)
+    interval = bootstrap_interval(blocks, lambda sums: np.sqrt(sums[:, 0] / sums[:, 1]))
+    return _share(float(np.sqrt(blocks[:, 0].sum() / blocks[:, 1].sum())), interval, 2) + ' px'
 
 
 def tracking_table(results: Sequence[RecordingResult]) -> str:
