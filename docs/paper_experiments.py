@@ -108,7 +108,7 @@ def rooms() -> dict[str, Room]:
     calibrated = make_description({'beacons': [{}]}).beacons[0].led
     brightness = INDOOR_CD_M2 / OUTDOOR_CD_M2 * (far_n / near_n) ** 2
     contrast = calibrated.contrast * DIM_CD / BRIGHT_CD * ((near_mm / near_n) / (far_mm / far_n)) ** 2
-    direct = {'contrast': contrast, 'size_mm': 5.0, 'rise_us': 1.0, 'fall_us': 1.0, 'slow_share': 0.0}
+    direct = {'contrast': contrast, 'size_mm': 5.0} | dict.fromkeys(('rise_us', 'fall_us', 'rise_slew_us', 'fall_slew_us'), 1.0)
     return {
         'outdoor': Room('outdoor', 1.0, 1e3 * far_mm / PIXEL_UM, {}),
         'indoor': Room('indoor', brightness, 1e3 * near_mm / PIXEL_UM, direct),
