@@ -14,7 +14,7 @@ from beacon_comm.core.events import EventBatch
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.high_pass import HighPassFilter
 from beacon_comm.core.parameters import Parameters
-from beacon_comm.evaluation.figures import nines, rolling_share
+from beacon_comm.evaluation.figures import extremes, nines, rolling_share
 from beacon_comm.evaluation.page import STYLE, Page, inline_svg, new_figure
 from beacon_comm.evaluation.scoring import CharacterError, not_found
 from beacon_comm.evaluation.views import Stretch, choose_stretch, image_span_ns, sent_within, trace_filter, view_image
@@ -214,6 +214,11 @@ def test_a_stretch_is_chosen_around_an_error_else_in_the_middle() -> None:
 def test_numbers_for_the_curves() -> None:
     right = np.array([1, 1, 0, 1], bool)
     assert rolling_share(right, 2).tolist() == [1.0, 1.0, 0.5, 0.5]
+    spiky = np.zeros(1000)
+    spiky[[137, 700]] = 5.0, -3.0
+    kept = extremes(spiky, 20)
+    assert {0, 137, 700, 999} <= set(kept.tolist()) and len(kept) <= 42
+    assert extremes(spiky[:30], 20).tolist() == list(range(30))
     assert (nines(0.0), nines(0.99), nines(1.0)) == (0.0, pytest.approx(2.0), 6.0)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -82,10 +83,12 @@ def _milliseconds(view: SignalView, t_ns: Any) -> Any:
 def _draw_filtered(axes: Axes, view: SignalView) -> None:
     trace = view.trace
     t = _milliseconds(view, trace.t_ns)
-    axes.fill_between(t, trace.low, trace.high, color=SHADE, linewidth=0)
-    axes.plot(t, trace.filtered, color=INK, linewidth=0.9, rasterized=len(t) > 20_000)
-    axes.plot(t, trace.high, color=HIGH_COLOUR, linewidth=1.2, label='high level')
-    axes.plot(t, trace.low, color=LOW_COLOUR, linewidth=1.2, label='low level')
+    few = slice(None, None, max(1, len(t) // 300))  # the levels change slowly
+    axes.fill_between(t[few], trace.low[few], trace.high[few], color=SHADE, linewidth=0)
+    kept = extremes(trace.filtered, MOST_POINTS)
+    axes.plot(t[kept], trace.filtered[kept], color=INK, linewidth=0.9)
+    axes.plot(t[few], trace.high[few], color=HIGH_COLOUR, linewidth=1.2, label='high level')
+    axes.plot(t[few], trace.low[few], color=LOW_COLOUR, linewidth=1.2, label='low level')
     _name(axes, 'filtered\nsignal\n(events)')
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + 0.22 * (high - low))
@@ -362,6 +365,15 @@ def reliability_figure(bins: Mapping[str, Sequence[Bin]]) -> Figure:
 def nines(share: float) -> float:
     """Return −log10(1 − share), at most :data:`MOST_NINES`: the nines of a share, with 0 at 0."""
     return min(MOST_NINES, -math.log10(max(1.0 - share, 10.0**-MOST_NINES)))
+
+
+def extremes(values: NDArray[np.float64], most: int) -> NDArray[np.int64]:
+    """Return the places of the least and the greatest value of each of so many stretches: what a curve looks like, ``(m,)``."""
+    if len(values) <= 2 * most:
+        return np.arange(len(values))
+    edges = np.linspace(0, len(values), most + 1).astype(np.int64)
+    places = [(a + int(np.argmin(values[a:b])), a + int(np.argmax(values[a:b]))) for a, b in pairwise(edges)]
+    return np.unique(np.array([0, *(place for pair in places for place in pair), len(values) - 1], np.int64))
 
 
 def rolling_share(right: NDArray[np.bool_], count: int = ROLLING_CHARACTERS) -> NDArray[np.float64]:
