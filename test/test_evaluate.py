@@ -113,7 +113,7 @@ def check_scene(scene: dict) -> None:
         if beacon['position'] is not None:
             assert list(beacon['position']) == [
                 'instants', 'rms_px', 'rms_interval_px', 'median_px', 'p95_px', 'speed_px_per_s', 'lag_s',
-                'nees', 'nees_interval', 'bearing_rms_rad',
+                'nees', 'nees_interval', 'bearing_rms_rad', 'bearing_nees', 'bearing_nees_interval',
             ]  # fmt: skip
 
 
@@ -438,6 +438,6 @@ def test_the_document_names_every_key() -> None:
         ' partly_tracked mostly_lost mota motp_px idf1 id_precision id_recall hota detection_accuracy association_accuracy'
         ' mota_interval motp_interval_px message_interval bit_interval bits wrong_bits missing name kind seen_s locks begin_s'
         ' lock_s lost confirm_s position instants rms_px rms_interval_px median_px p95_px speed_px_per_s lag_s nees'
-        ' nees_interval bearing_rms_rad'
+        ' nees_interval bearing_rms_rad bearing_nees bearing_nees_interval'
     )
     assert [key for key in keys.split() if f'`{key}`' not in document] == []

@@ -163,6 +163,13 @@ def test_position_lag_and_consistency() -> None:
     (one,) = scored([track(beacon, azimuth_rad=0.1, elevation_rad=-0.19)], [beacon]).beacons
     assert one.position is not None
     assert one.position.bearing_rms_rad == pytest.approx(0.01)
+    assert one.position.bearing_nees is None
+    # 0.01 rad off in elevation, with a variance of 0.00005 rad²: NEES = (0.0001 / 0.00005) / 2 = 1.
+    stated = {'azimuth_rad': 0.1, 'elevation_rad': -0.19, 'covariance_rad2': (1e-6, 0.0, 5e-5)}
+    (one,) = scored([track(beacon, **stated)], [beacon]).beacons
+    assert one.position is not None and one.position.bearing_nees == pytest.approx(1.0)
+    (one,) = scored([track(beacon, azimuth_rad=0.1, elevation_rad=-0.19)], [beacon]).beacons
+    assert one.position is not None
     assert (one.position.nees, one.position.lag_s) == (None, pytest.approx(0.0))
 
 

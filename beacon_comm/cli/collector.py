@@ -136,5 +136,13 @@ def _point(snapshot: BeaconSnapshot, t_ns: int) -> PathPoint:
         snapshot.quiet,
         snapshot.azimuth_rad,
         snapshot.elevation_rad,
-        getattr(snapshot, 'covariance_px2', None),
+        _upper(getattr(snapshot, 'pixel_covariance', None)),
+        _upper(getattr(snapshot, 'angle_covariance', None)),
     )
+
+
+def _upper(covariance: tuple[tuple[float, float], tuple[float, float]] | None) -> tuple[float, float, float] | None:
+    if covariance is None:
+        return None
+    (xx, xy), (_, yy) = covariance
+    return xx, xy, yy

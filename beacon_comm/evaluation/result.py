@@ -28,6 +28,7 @@ class PathPoint:
         quiet: no events in the last window; the position is predicted.
         azimuth_rad, elevation_rad: bearing, None without calibration.
         covariance_px2: of the centre, as xx, xy, yy (px²); None: the receiver states none.
+        covariance_rad2: of azimuth and elevation, likewise (rad²).
     """
 
     t_ns: int
@@ -39,6 +40,7 @@ class PathPoint:
     azimuth_rad: float | None = None
     elevation_rad: float | None = None
     covariance_px2: tuple[float, float, float] | None = None
+    covariance_rad2: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)

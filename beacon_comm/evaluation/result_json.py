@@ -156,6 +156,8 @@ def _position(position: PositionScore) -> dict[str, Any]:
         'nees': position.nees,
         'nees_interval': _interval(position.nees_interval),
         'bearing_rms_rad': position.bearing_rms_rad,
+        'bearing_nees': position.bearing_nees,
+        'bearing_nees_interval': _interval(position.bearing_nees_interval),
     }
 
 

@@ -71,6 +71,7 @@ class PositionScore:
         nees: mean of eᵀ P⁻¹ e / 2, 1 where the stated covariance P is true; None: none is stated.
         nees_interval: of it.
         bearing_rms_rad: of the angle to the true bearing, None without calibration.
+        bearing_nees, bearing_nees_interval: as ``nees``, of azimuth and elevation.
     """
 
     t_ns: Ints
@@ -84,6 +85,8 @@ class PositionScore:
     nees: float | None
     nees_interval: Interval | None
     bearing_rms_rad: float | None
+    bearing_nees: float | None
+    bearing_nees_interval: Interval | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -502,10 +505,11 @@ def _position(truth: _Truth, b: int, instants_ns: Ints, track: Ints, points: Seq
     lag_s = -float((error * velocity)[fast].sum() / (velocity[fast] ** 2).sum()) if fast.any() else None
     squares = _blocks(t_ns, distance**2)
     rms = bootstrap_interval(squares, lambda sums: np.sqrt(sums[:, 0] / sums[:, 1]))
-    nees_of = [(n, _nees(e, point.covariance_px2)) for n, (e, (_, point)) in enumerate(zip(error, on, strict=True))]
-    stated = [(n, value) for n, value in nees_of if value is not None]
-    nees = np.array([value for _, value in stated])
-    nees_blocks = _blocks(t_ns[[n for n, _ in stated]], nees)
+    nees, nees_interval = _consistency(t_ns, error, [point.covariance_px2 for _, point in on])
+    angles = _bearing_errors(truth.beacons[b], t_ns + truth.shift_ns, [point for _, point in on])
+    bearing: tuple[float | None, Interval | None] = (None, None)
+    if angles is not None:
+        bearing = _consistency(t_ns, angles[1], [point.covariance_rad2 for _, point in on])
     return PositionScore(
         t_ns=t_ns,
         error_px=error,
@@ -515,17 +519,31 @@ def _position(truth: _Truth, b: int, instants_ns: Ints, track: Ints, points: Seq
         interval_px=rms,
         lag_s=lag_s,
         speed_px_per_s=float(speed.mean()),
-        nees=float(nees.mean()) if len(nees) else None,
-        nees_interval=bootstrap_interval(nees_blocks, lambda sums: sums[:, 0] / sums[:, 1]) if len(nees) else None,
-        bearing_rms_rad=_bearing_rms(truth.beacons[b], t_ns + truth.shift_ns, [point for _, point in on]),
+        nees=nees,
+        nees_interval=nees_interval,
+        bearing_rms_rad=None if angles is None else float(np.sqrt(np.mean(angles[0] ** 2))),
+        bearing_nees=bearing[0],
+        bearing_nees_interval=bearing[1],
     )
 
 
-def _nees(error: Floats, covariance_px2: tuple[float, float, float] | None) -> float | None:
+def _consistency(
+    t_ns: Ints, error: Floats, covariances: Sequence[tuple[float, float, float] | None]
+) -> tuple[float | None, Interval | None]:
+    """Return the mean of the normalised errors squared over their expectation, and its interval; None: none is stated."""
+    found = [(n, _nees(error[n], one)) for n, one in enumerate(covariances)]
+    rows = [n for n, value in found if value is not None]
+    values = np.array([value for _, value in found if value is not None], np.float64)
+    if not rows:
+        return None, None
+    return float(values.mean()), bootstrap_interval(_blocks(t_ns[rows], values), lambda sums: sums[:, 0] / sums[:, 1])
+
+
+def _nees(error: Floats, covariance: tuple[float, float, float] | None) -> float | None:
     """Return eᵀ P⁻¹ e over its expectation, 2 (Y. Bar-Shalom et al., 2001, section 5.4); P as xx, xy, yy."""
-    if covariance_px2 is None:
+    if covariance is None:
         return None
-    xx, xy, yy = covariance_px2
+    xx, xy, yy = covariance
     determinant = xx * yy - xy * xy
     if not determinant > 0.0:
         return None
@@ -533,17 +551,21 @@ def _nees(error: Floats, covariance_px2: tuple[float, float, float] | None) -> f
     return float((yy * x * x - 2.0 * xy * x * y + xx * y * y) / determinant) / 2.0
 
 
-def _bearing_rms(beacon: TrueBeacon, scene_ns: Ints, points: Sequence[PathPoint]) -> float | None:
+def _bearing_errors(
+    beacon: TrueBeacon, scene_ns: Ints, points: Sequence[PathPoint]
+) -> tuple[Floats, Floats] | None:
+    """Return the angles between the bearings (rad) ``(n,)``, and the errors of azimuth and elevation (rad) ``(n, 2)``."""
     true = beacon.bearing(scene_ns)
     pairs = [(point.azimuth_rad, point.elevation_rad) for point in points]
     if true is None or any(a is None or e is None for a, e in pairs):
         return None
     azimuth, elevation = np.array(pairs, np.float64).T
     true_azimuth, true_elevation = (np.asarray(angle, np.float64) for angle in true)
+    turned = (azimuth - true_azimuth + np.pi) % (2.0 * np.pi) - np.pi
     # The angle on the sphere, by haversines: exact for small ones.
-    across = np.cos(elevation) * np.cos(true_elevation) * np.sin((azimuth - true_azimuth) / 2.0) ** 2
+    across = np.cos(elevation) * np.cos(true_elevation) * np.sin(turned / 2.0) ** 2
     angle = 2.0 * np.arcsin(np.sqrt(np.sin((elevation - true_elevation) / 2.0) ** 2 + across))
-    return float(np.sqrt(np.mean(angle**2)))
+    return angle, np.column_stack((turned, elevation - true_elevation))
 
 
 def _blocks(t_ns: Ints, values: Floats) -> Floats:
