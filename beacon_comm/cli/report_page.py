@@ -359,7 +359,8 @@ def _text_html(subject: Subject, transmissions: Sequence[Transmission]) -> str:
                 read = '□' if error.received is None else _letter(error.received.code)
                 said = 'nothing read' if error.received is None else f'read {chr(error.received.code)!r}'
                 hint = f'sent {text[k]!r}, {said}'
-                letters.append(f'<span class=w title="{html.escape(hint, quote=True)}">{read}</span>')
+                letters.append(f'<span class=w title="{html.escape(hint, quote=True)}">{read.rstrip()}</span>')
+                letters += ['\n'] if text[k] == '\n' else []  # the lines stay those of the text
         inserted = f', {one.inserted} inserted' if one.inserted else ''
         begins = f'from {(one.start_ns or 0) / NS_PER_S:.3f} s' if one.first == 0 else f'from character {one.first + 1} on'
         parts.append(
