@@ -155,7 +155,6 @@ def _page(
         'What is counted and how stands in <code>docs/evaluation.md</code>. No truth enters a decoder; intervals take errors'
         ' for independent (Wilson) or stretches of half a second (bootstrap).'
     )
-    page.raw(f'<pre>{html.escape(command)}</pre>')
     for receiver, one in options.items():
         page.folded(f'Parameters of {receiver}', parameters_table(_shown_parameters(one.parameters)))
     return page
@@ -272,9 +271,9 @@ def _recording(page: Page, view: RecordingView, frame: CharacterFrame) -> None:
         image = view.image
         page.figure(
             image_figure(image),
-            f'The index image at {image.t_ns / NS_PER_S:.3f} s (window {1e3 * image.window_s:g} ms) with the'
-            f' {len(image.blobs)} blobs found in it (white rings). Coloured lines: confirmed tracks over the whole recording,'
-            ' with their labels and where they are at this instant; grey: other tracks'
+            f'The index image at {image.t_ns / NS_PER_S:.3f} s (window {1e3 * image.window_s:g} ms); the receiver finds'
+            f' {len(image.blobs) or "no"} blob{"s" * (len(image.blobs) != 1)} then (white rings). Coloured lines: confirmed'
+            ' tracks over the whole recording, with their labels and where they are at this instant; grey: other tracks'
             + ('; broad pale lines: the true paths.' if any(path.true for path in image.paths) else '.'),
             'index image with blobs and paths',
         )
