@@ -55,10 +55,11 @@ WHOLE = 'sequence, whole receiver'
 ALL = (*RECEIVERS, WHOLE)
 FRAME = CharacterFrame()
 SIZE_PX = 64
-# Characters that are sent before those that count, so that the receiver has found the signal, and after them.
-LEAD_IN, LEAD_OUT = 40, 8
+# What is sent before the characters that count, so that the receiver has found the signal: this long (s), and so many
+# characters at least; and how many after them.
+LEAD_IN_S, LEAD_IN, LEAD_OUT = 0.3, 16, 4
 # Signals are simulated for no longer than this (s) or the whole sonnet, but for so many characters at least.
-LONGEST_S, QUICK_S = 12.0, 1.5
+LONGEST_S, QUICK_S = 8.0, 1.5
 FEWEST = 30
 NEAR_RADII, LEAST_RADIUS_PX = 1.5, 3.0
 
@@ -138,10 +139,16 @@ def characters_at(bit_rate_bps: float, longest_s: float) -> int:
     return int(np.clip(longest_s * bit_rate_bps / FRAME.length, FEWEST, len(SONNET18)))
 
 
+def lead_in(bit_rate_bps: float) -> int:
+    """Return how many characters are sent before those that count."""
+    return int(np.clip(LEAD_IN_S * bit_rate_bps / FRAME.length, LEAD_IN, len(SONNET18)))
+
+
 def run_point(room: Room, distance_m: float, bit_rate_bps: float, longest_s: float, seed: int) -> list[Point]:
     """Simulate one distance and bit rate, and let both receivers read it."""
     count = characters_at(bit_rate_bps, longest_s)
-    text = (SONNET18[-LEAD_IN:] + SONNET18)[: LEAD_IN + count]
+    first = lead_in(bit_rate_bps)
+    text = SONNET18[-first:] + SONNET18[:count]
     length_s = FRAME.duration_ns(bit_rate_bps) / NS_PER_S
     start_s = 0.05
     description = make_description(
@@ -182,10 +189,8 @@ def run_point(room: Room, distance_m: float, bit_rate_bps: float, longest_s: flo
         parameters = Parameters(receiver=name, bit_rates=(bit_rate_bps,))
         read[name] = receive_signal(t_ns, polarity, parameters).characters if len(t_ns) else ()
     start_ns, events = int(beacon.sendings_ns[0]), len(t_ns) / (FRAME.length * (len(text) + LEAD_OUT))
-    return [
-        Point(room.name, distance_m, bit_rate_bps, name, scored_as_the_paper(read[name], text, start_ns, bit_rate_bps), events)
-        for name in ALL
-    ]
+    scored = {name: scored_as_the_paper(read[name], text, first, start_ns, bit_rate_bps) for name in ALL}
+    return [Point(room.name, distance_m, bit_rate_bps, name, one, events) for name, one in scored.items()]
 
 
 def on_beacon(collector: Collector, middle: np.ndarray[Any, np.dtype[np.float64]], near_px: float) -> Sequence[Character]:
@@ -199,15 +204,17 @@ def on_beacon(collector: Collector, middle: np.ndarray[Any, np.dtype[np.float64]
     return primary_characters(near, FRAME)
 
 
-def scored_as_the_paper(read: Sequence[Character], text: str, start_ns: int, bit_rate_bps: float) -> Transmission:
-    """Score what was sent after the lead-in; a start that is not found in what was read is accuracy 0 and 0.5."""
+def scored_as_the_paper(
+    read: Sequence[Character], text: str, first: int, start_ns: int, bit_rate_bps: float
+) -> Transmission:
+    """Score what was sent from character ``first`` on; a start that is not found in what was read is accuracy 0 and 0.5."""
     length_ns = FRAME.duration_ns(bit_rate_bps)
     span_ns = (0, round(start_ns + (len(text) + 2) * length_ns))
     known = replace(
-        not_found(text, FRAME), start_ns=start_ns, bit_rate_bps=bit_rate_bps, first=LEAD_IN, characters=len(text) - LEAD_IN
+        not_found(text, FRAME), start_ns=start_ns, bit_rate_bps=bit_rate_bps, first=first, characters=len(text) - first
     )
     if not score(read, text, span_ns, None, FRAME):
-        return not_found(text[LEAD_IN:], FRAME)
+        return not_found(text[first:], FRAME)
     return score_at(read, text, [known], FRAME)[0]
 
 
@@ -503,8 +510,8 @@ def page(
         ' outdoor recordings, carried to other distances by the inverse square law. The receivers read the events of the'
         " blob, as in the paper's recordings; the *whole receiver* finds and follows it in an image of"
         f' {SIZE_PX}×{SIZE_PX} pixels besides. The listed rate is the true one. Each point sends the beginning of Sonnet 18,'
-        f' for {LONGEST_S:g} s or to its end, {FEWEST} characters at least, after {LEAD_IN} characters that do not count; one'
-        ' run a point.',
+        f' for {LONGEST_S:g} s or to its end, {FEWEST} characters at least, after {LEAD_IN_S:g} s of its end that do not'
+        f' count, {LEAD_IN} characters at least; one run a point.',
         markdown_table(columns, statement_rows(points)),
         '## Control voltage against filtered events, 4 kHz (simulated)',
         '![Control voltage, filtered events, events and binarised line](figures/paper_control_voltage.png)',

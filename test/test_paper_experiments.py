@@ -38,26 +38,27 @@ def read(text: str, bit_rate_bps: float) -> list[Character]:
     ]
 
 
-@pytest.mark.parametrize(('bit_rate_bps', 'count'), [(20.0, 30), (500.0, 545), (3125.0, 618), (10_000.0, 618)])
+@pytest.mark.parametrize(('bit_rate_bps', 'count'), [(20.0, 30), (500.0, 363), (3125.0, 618), (10_000.0, 618)])
 def test_how_much_is_sent(bit_rate_bps, count) -> None:
-    assert paper.characters_at(bit_rate_bps, 12.0) == count
+    assert paper.characters_at(bit_rate_bps, 8.0) == count
 
 
 def test_what_comes_first_does_not_count() -> None:
     text = SONNET18[:100]
     right = read(text, 500.0)
-    lead_in = paper.LEAD_IN
-    score = paper.scored_as_the_paper(right[20:], text, START_NS, 500.0)
+    lead_in = paper.lead_in(500.0)
+    assert (lead_in, paper.lead_in(10_000.0)) == (16, 272)
+    score = paper.scored_as_the_paper(right[5:], text, lead_in, START_NS, 500.0)
     assert (score.characters, score.wrong) == (100 - lead_in, 0)
     wrong = [*right[: lead_in + 3], replace(right[lead_in + 3], code=1), *right[lead_in + 5 :]]
-    score = paper.scored_as_the_paper(wrong, text, START_NS, 500.0)
+    score = paper.scored_as_the_paper(wrong, text, lead_in, START_NS, 500.0)
     assert (score.wrong, score.missing) == (2, 1)
 
 
 @pytest.mark.parametrize('characters', [[], read('U' * 60, 500.0)])
 def test_without_a_start_accuracy_is_set(characters) -> None:
     """The paper's section IV: message error rate 1 and bit error rate 0.5."""
-    score = paper.scored_as_the_paper(characters, SONNET18[:100], START_NS, 500.0)
+    score = paper.scored_as_the_paper(characters, SONNET18[:100], 16, START_NS, 500.0)
     assert (score.message_accuracy, score.bit_accuracy) == (0.0, 0.5)
     assert paper.accuracy(score) == 'no start: 0, 0.5'
 
