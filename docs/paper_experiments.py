@@ -21,6 +21,7 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -218,14 +219,15 @@ def scored_as_the_paper(
     return score_at(read, text, [known], FRAME)[0]
 
 
-def run_series(names: Sequence[str], full: bool, seed: int) -> list[Point]:
+def run_series(names: Sequence[str], full: bool, seed: int, processes: int = 1) -> list[Point]:
     """Simulate all distances and bit rates of some rooms."""
     axes = {'outdoor': (OUTDOOR_M, OUTDOOR_BPS), 'indoor': (INDOOR_M, INDOOR_BPS)} if full else QUICK
     jobs = [(rooms()[name], metres, rate) for name in names for metres in axes[name][0] for rate in axes[name][1]]
-    points = []
-    for room, metres, rate in progress(jobs, 'simulated points', len(jobs)):
-        points += run_point(room, metres, rate, LONGEST_S if full else QUICK_S, seed)
-    return points
+    longest_s = LONGEST_S if full else QUICK_S
+    with ProcessPoolExecutor(processes) as pool:
+        running = [pool.submit(run_point, *job, longest_s, seed) for job in jobs]
+        found = [job.result() for job in progress(running, 'simulated points', len(jobs))]
+    return [point for points in found for point in points]
 
 
 # The real recordings
@@ -552,12 +554,13 @@ def main() -> None:
     parser.add_argument('--write', action='store_true', help='write the page and its figures')
     parser.add_argument('--output', type=Path, default=PAGE, help='where to (default: docs/paper_experiments.md)')
     parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--processes', type=int, default=1, help='points simulated at once')
     arguments = parser.parse_args()
     recorded = run_recorded(Path(arguments.folder))
     if not recorded:
         print('no recordings: the outdoor table stays empty', file=sys.stderr)
     wave = run_square_wave(arguments.seed)
-    points = run_series(('outdoor', 'indoor'), arguments.full, arguments.seed)
+    points = run_series(('outdoor', 'indoor'), arguments.full, arguments.seed, arguments.processes)
     text = page(recorded, points, wave, arguments.full, arguments.seed)
     print(text)
     if arguments.write:
