@@ -53,8 +53,8 @@ Simulated = tuple[Iterator[EventBatch], SceneTruth]
 
 
 def parameters(**changes: Any) -> Parameters:
-    """Return the defaults with the scenes' bit rate listed."""
-    return Parameters(bit_rates=(BIT_RATE,), **changes)
+    """Return the defaults with the scenes' bit rate listed and the motion tracker, but for the changes."""
+    return Parameters(**{'bit_rates': (BIT_RATE,), 'tracker': 'motion', **changes})
 
 
 def scene(paths: list[dict[str, Any]], duration_s: float, seed: int, **content: Any) -> Simulated:
@@ -402,8 +402,8 @@ def _shown(value: Any) -> str:
 HEAD = """# Tracking
 
 Written by `COMMAND` on simulated scenes ([docs/simulator.md](simulator.md)): 640 × 480, beacons of 1 kbps, default parameters
-with the bit rate listed. `motion` is the default tracker ([following.py](../beacon_comm/core/following.py),
-[motion.py](../beacon_comm/core/motion.py), [motion_tracks.py](../beacon_comm/core/motion_tracks.py)), `nearest` the paper's.
+with the bit rate listed. `motion` follows tracks by their own events ([following.py](../beacon_comm/core/following.py),
+[motion.py](../beacon_comm/core/motion.py), [motion_tracks.py](../beacon_comm/core/motion_tracks.py)), `nearest`, the default, is the paper's.
 """
 SPEEDS = """Slow until locked, then ramped up to the speed; a straight line that turns back at the borders, scored from 10 ms
 after each turn, and a circle of 200 px radius. In parentheses: 95 % intervals (Wilson).

@@ -60,7 +60,7 @@ def still(x: float, y: float) -> Path:
 
 @pytest.mark.parametrize(('path', 'within_px'), [(bouncing(2000.0), 1.0), (circling(2000.0), 1.0), (circling(5000.0), 3.0)])
 def test_a_fast_blob_is_one_track_that_gets_its_events(path: Path, within_px: float) -> None:
-    detector, error = Detector(Parameters(bit_rates=(1000.0,)), SIZE), []
+    detector, error = Detector(Parameters(bit_rates=(1000.0,), tracker='motion'), SIZE), []
 
     def look(t_hop: int, changes: object) -> None:
         if t_hop > T0_NS + 350_000_000:
@@ -93,7 +93,7 @@ def test_two_that_cross_keep_their_labels(angle_deg: float, past_px: float) -> N
         )
         for sign in (1.0, -1.0)
     ]
-    detector = Detector(Parameters(bit_rates=(1000.0,)), SIZE)
+    detector = Detector(Parameters(bit_rates=(1000.0,), tracker='motion'), SIZE)
     where: dict[int, list[tuple[float, float]]] = {}
 
     def look(t_hop: int, changes: object) -> None:
@@ -108,7 +108,7 @@ def test_two_that_cross_keep_their_labels(angle_deg: float, past_px: float) -> N
 
 
 FAST = merged(along(bouncing(3000.0), 0.0, 0.5), along(still(200.0, 40.0), 0.1, 0.5, 1), noise(*SIZE, 30_000, 0.5))
-BATCHING = Parameters(lost_after_s=0.05, bit_rates=(1000.0,))
+BATCHING = Parameters(tracker='motion', lost_after_s=0.05, bit_rates=(1000.0,))
 
 
 @settings(max_examples=10, deadline=None)
@@ -123,7 +123,7 @@ def test_what_was_hidden_for_a_moment_goes_on_under_its_label(speed: float) -> N
     def path(t_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return 60.0 + speed * t_s, np.full(len(t_s), 100.0)
 
-    detector, quiet = Detector(Parameters(bit_rates=(1000.0,)), SIZE), []
+    detector, quiet = Detector(Parameters(bit_rates=(1000.0,), tracker='motion'), SIZE), []
     events = merged(along(path, 0.0, 0.4), along(path, 0.5, 0.7, 1), noise(*SIZE, 50_000, 0.7))
     detect(detector, events, lambda t_hop, changes: quiet.append(any(t.quiet for t in detector.tracks.values())))
     assert list(detector.tracks) == [1] and any(quiet) and not quiet[-1]
@@ -134,10 +134,10 @@ def test_what_was_hidden_for_a_moment_goes_on_under_its_label(speed: float) -> N
 @pytest.mark.parametrize(
     ('parameters', 'rate_bps', 'x_px', 'label'),
     [
-        (Parameters(lost_after_s=0.1), 1000.0, 60.0, 1),
-        (Parameters(lost_after_s=0.1), None, 60.0, 2),
-        (Parameters(lost_after_s=0.1), 1000.0, 160.0, 2),
-        (Parameters(lost_after_s=0.1, reacquire_s=0.5), 1000.0, 60.0, 2),
+        (Parameters(tracker='motion', lost_after_s=0.1), 1000.0, 60.0, 1),
+        (Parameters(tracker='motion', lost_after_s=0.1), None, 60.0, 2),
+        (Parameters(tracker='motion', lost_after_s=0.1), 1000.0, 160.0, 2),
+        (Parameters(tracker='motion', lost_after_s=0.1, reacquire_s=0.5), 1000.0, 60.0, 2),
     ],
 )
 def test_a_lost_label_comes_back_where_it_was_lost_and_only_there(
@@ -152,7 +152,7 @@ def test_a_lost_label_comes_back_where_it_was_lost_and_only_there(
 
 
 def test_a_label_that_was_given_wrongly_is_taken_away() -> None:
-    detector = Detector(Parameters(lost_after_s=0.1), SIZE)
+    detector = Detector(Parameters(tracker='motion', lost_after_s=0.1), SIZE)
     detect(detector, along(still(60.0, 100.0), 0.0, 0.3))
     detector.tracks[1].bit_rate_bps = 1000.0
     back = along(still(60.0, 100.0), 1.0, 1.4)
@@ -178,7 +178,7 @@ def test_the_error_is_as_large_as_the_covariance_says() -> None:
         def path(t_s: np.ndarray, begin=begin, speed=speed) -> tuple[np.ndarray, np.ndarray]:
             return begin[0] + speed * t_s, np.full(len(t_s), begin[1])
 
-        detector = Detector(Parameters(bit_rates=(1000.0,), event_latency_s=0.0), SIZE)
+        detector = Detector(Parameters(bit_rates=(1000.0,), tracker='motion', event_latency_s=0.0), SIZE)
 
         def look(t_hop: int, changes: object, detector=detector, path=path) -> None:
             if t_hop > T0_NS + 250_000_000:
@@ -202,7 +202,7 @@ def test_a_moving_light_is_ahead_of_its_events() -> None:
 
 def test_a_new_beacon_in_the_path_of_a_fast_one_is_found() -> None:
     """The fast one's events are not in the windows: no trail, and nothing that hides the new one."""
-    detector = Detector(Parameters(bit_rates=(1000.0,)), SIZE)
+    detector = Detector(Parameters(bit_rates=(1000.0,), tracker='motion'), SIZE)
     path = circling(1000.0, 60.0)
     detect(detector, merged(along(path, 0.0, 0.8), along(still(220.0, 120.0), 0.5, 0.8, 1)))
     assert sorted(detector.tracks) == [1, 2]
@@ -211,7 +211,7 @@ def test_a_new_beacon_in_the_path_of_a_fast_one_is_found() -> None:
 
 
 def test_hops_without_any_event_cost_no_track_its_velocity_at_once() -> None:
-    detector = Detector(Parameters(bit_rates=(1000.0,)), SIZE)
+    detector = Detector(Parameters(bit_rates=(1000.0,), tracker='motion'), SIZE)
 
     def path(t_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return 40.0 + 400.0 * t_s, np.full(len(t_s), 100.0)

@@ -137,7 +137,7 @@ def test_the_last_character_before_a_silence_comes_out_by_time_alone() -> None:
 def test_a_silent_track_is_quiet_then_lost_and_its_label_comes_back_with_its_rate_alone(
     reacquire_s: float, rate_bps: float, label: int
 ) -> None:
-    receiver = Receiver(Parameters(lost_after_s=0.5, reacquire_s=reacquire_s), SIZE)
+    receiver = Receiver(Parameters(tracker='motion', lost_after_s=0.5, reacquire_s=reacquire_s), SIZE)
     beacon = on_disc(simulate_text(TEXT, 3125.0, t0_ns=0, lead_s=0.0, tail_s=0.0, seed=6), still(40, 30))
     receiver.push(beacon)
     end_ns = int(beacon.t_ns[-1])

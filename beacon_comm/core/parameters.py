@@ -202,9 +202,9 @@ class Parameters(Declared):
 
     # Tracks
     tracker: str = parameter(
-        'motion',
-        "motion: tracks move on with their own events, filtered; nearest: blobs' nearest neighbours at hops, the paper's",
-        choices=('motion', 'nearest'),
+        'nearest',
+        "nearest: blobs' nearest neighbours at hops, the paper's; motion: tracks move on with their own events, filtered",
+        choices=('nearest', 'motion'),
     )
     event_latency_s: float = parameter(
         130e-6, 'motion: events come so long after the light; a moving beacon is ahead of them', 's', 0.0, 0.01
