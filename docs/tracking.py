@@ -403,7 +403,8 @@ HEAD = """# Tracking
 
 Written by `COMMAND` on simulated scenes ([docs/simulator.md](simulator.md)): 640 × 480, beacons of 1 kbps, default parameters
 with the bit rate listed. `motion` follows tracks by their own events ([following.py](../beacon_comm/core/following.py),
-[motion.py](../beacon_comm/core/motion.py), [motion_tracks.py](../beacon_comm/core/motion_tracks.py)), `nearest`, the default, is the paper's.
+[motion.py](../beacon_comm/core/motion.py), [motion_tracks.py](../beacon_comm/core/motion_tracks.py)); `nearest` is the paper's,
+and the default.
 """
 SPEEDS = """Slow until locked, then ramped up to the speed; a straight line that turns back at the borders, scored from 10 ms
 after each turn, and a circle of 200 px radius. In parentheses: 95 % intervals (Wilson).

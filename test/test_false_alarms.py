@@ -84,3 +84,10 @@ def test_receivers_are_all_that_are_declared() -> None:
     receivers = declared_receivers(bit_rates=(504.0,))
     assert receivers['threshold'].receiver == 'threshold'
     assert all(parameters.bit_rates == (504.0,) for parameters in receivers.values())
+
+
+def test_a_lock_that_is_lost_in_what_was_said_before_it_is_not_found_for_ever() -> None:
+    # Regular edges that resemble a beacon for a while: read back, each lock is lost at the same place.
+    name = 'moving edges, regular'
+    events = false_alarms.candidate(false_alarms.SIMULATED[name], name, 333)
+    assert not false_alarms.try_candidate(name, 333, events, Parameters()).confirmed

@@ -339,9 +339,8 @@ def _eye(bins):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _eyes(t, polarity, start, periods, stop):  # type: ignore[no-untyped-def]
     """Return the best eye at each period, ``(k,)``: from the sums of all signed events up to times that the periods share."""
-    step = periods.min() / EYE_STEPS
-    sums = np.zeros(int((stop - start) / step) + 2, np.int64)
-    scale = 1.0 / step
+    scale = EYE_STEPS / periods.min()
+    sums = np.zeros(int((stop - start) * scale) + 2, np.int64)  # by the same product as the places
     for i in range(len(t)):
         sums[np.uint64((t[i] - start) * scale) + np.uint64(1)] += polarity[i]
     for k in range(1, len(sums)):
@@ -349,6 +348,8 @@ def _eyes(t, polarity, start, periods, stop):  # type: ignore[no-untyped-def]
     best = np.zeros(len(periods))
     for k in range(len(periods)):
         per_bit = periods[k] * scale
+        if len(sums) <= per_bit:
+            continue
         for phase in range(PHASES):
             eye, early = 0, sums[np.uint64(phase * per_bit / PHASES)]
             for n in range(1, int(len(sums) / per_bit - phase / PHASES)):

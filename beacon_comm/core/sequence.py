@@ -96,6 +96,7 @@ class SequenceDemodulator:
         self._given_to = -math.inf  # end of the last character that was given out
         self._refine_at = math.inf  # time at which the lock is to be refined
         self._usable_from = -math.inf  # events before this are not read again
+        self._found_at = -math.inf  # when the lock was found
 
     @property
     def _t(self) -> NDArray[np.float64]:
@@ -222,11 +223,16 @@ class SequenceDemodulator:
     def _unlock(self, *, reread: bool) -> None:
         assert self._lock is not None
         lost_at = float(self._lock.clock.values[BORDER])
-        self._usable_from = max(self._given_to, lost_at - self._reread(self._lock) if reread else lost_at)
+        restart_at, usable_from = lost_at, lost_at - self._reread(self._lock) if reread else lost_at
+        if reread and lost_at < self._found_at:
+            # Lost in what was said before it was found: it would be lost there for ever.
+            restart_at = self._found_at
+            usable_from = max(lost_at, restart_at - REFINED_AFTER * self._frame.length * self._lock.period)
+        self._usable_from = max(self._given_to, usable_from)
         self._lock = None
         self._refine_at = math.inf
         self._taken = 0
-        self._restart(lost_at)
+        self._restart(restart_at)
 
     def _restart(self, t: float) -> None:
         for search in self._searches:
@@ -341,6 +347,7 @@ class SequenceDemodulator:
         border = float(lock.clock.values[BORDER])
         self._trusted = False
         self._pending = None
+        self._found_at = now
         self._refine_at = border + REFINED_AFTER * self._frame.length * lock.period
         if len(lock.positions) > (REFINED_AFTER - 5) * self._frame.length:
             self._refine_at = math.inf
