@@ -223,16 +223,13 @@ class SequenceDemodulator:
     def _unlock(self, *, reread: bool) -> None:
         assert self._lock is not None
         lost_at = float(self._lock.clock.values[BORDER])
-        restart_at, usable_from = lost_at, lost_at - self._reread(self._lock) if reread else lost_at
-        if reread and lost_at < self._found_at:
-            # Lost in what was said before it was found: it would be lost there for ever.
-            restart_at = self._found_at
-            usable_from = max(lost_at, restart_at - REFINED_AFTER * self._frame.length * self._lock.period)
-        self._usable_from = max(self._given_to, usable_from)
+        # What is lost in what was said before it was found would be found and lost there for ever.
+        reread &= lost_at >= self._found_at
+        self._usable_from = max(self._given_to, lost_at - self._reread(self._lock) if reread else lost_at)
         self._lock = None
         self._refine_at = math.inf
         self._taken = 0
-        self._restart(restart_at)
+        self._restart(max(lost_at, self._found_at))
 
     def _restart(self, t: float) -> None:
         for search in self._searches:
