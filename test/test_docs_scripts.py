@@ -1,26 +1,14 @@
 """The scripts in ``docs/`` that measure receivers: their parts on small cases, without a timing assertion."""
 
-import importlib.util
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
+from docs_script import load
 
 from beacon_comm.core.parameters import Parameters
 
-DOCS = Path(__file__).resolve().parents[1] / 'docs'
 THRESHOLD = Parameters(receiver='threshold', bit_rates=(504.0, 1000.0, 3125.0))
-
-
-def load(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, DOCS / f'{name}.py')
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 benchmark = load('benchmark_demodulators')

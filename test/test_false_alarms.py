@@ -1,29 +1,15 @@
 """The candidates of ``docs/false_alarms.py``: a tiny sample of every family, and nothing of it is confirmed."""
 
-import importlib.util
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
+from docs_script import load
 
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.evaluation.receivers import declared_receivers
 
-SCRIPT = Path(__file__).resolve().parents[1] / 'docs' / 'false_alarms.py'
-
-
-def load() -> ModuleType:
-    spec = importlib.util.spec_from_file_location('false_alarms', SCRIPT)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-false_alarms = load()
+false_alarms = load('false_alarms')
 SIMULATED = list(false_alarms.SIMULATED)
 
 

@@ -1,29 +1,14 @@
 """docs/paper_experiments.py: its parts on small cases; the page itself is made by hand."""
 
-import importlib.util
-import sys
 from dataclasses import replace
-from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
+from docs_script import load
 
 from beacon_comm.core.character import Character, Status
 from beacon_comm.evaluation.scoring import not_found
 from beacon_comm.evaluation.truth import SONNET18
-
-DOCS = Path(__file__).resolve().parents[1] / 'docs'
-
-
-def load(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, DOCS / f'{name}.py')
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
 
 paper = load('paper_experiments')
 START_NS = 50_000_000
