@@ -23,8 +23,9 @@ import math
 import numpy as np
 from numba import njit
 
-STEADY_S = 0.1  # a prediction goes on unchanged for this long …
-FADE_S = 1.0  # … and then fades with this time constant
+from beacon_comm.core.tracks import fading_s as _fading_s
+
+fading_s = njit(cache=True, nogil=True)(_fading_s)
 
 MODES = 5
 ACCELERATION = np.array([10.0, 5e3, 4e5, 2e7, 2e10])  # white acceleration (px²/s³)
@@ -63,14 +64,6 @@ EXTENT, HIDDEN, USUAL, LEAD2, TRUST = range(LONG_OFF + 1, LONG_OFF + 6)
 # The last observation's error over its standard deviation, and how much of it comes again in the next one.
 ERROR_X, ERROR_Y, AGAIN = range(TRUST + 1, TRUST + 4)
 WIDTH = AGAIN + 1
-
-
-@njit(cache=True, nogil=True)
-def fading_s(dt_s):  # type: ignore[no-untyped-def]
-    """Return s(dt), see the module's head."""
-    if dt_s <= STEADY_S:
-        return dt_s
-    return STEADY_S + FADE_S * (1.0 - math.exp((STEADY_S - dt_s) / FADE_S))
 
 
 @njit(cache=True, nogil=True)

@@ -45,18 +45,27 @@ from beacon_comm.core.motion import (
     X,
 )  # fmt: skip
 from beacon_comm.core.parameters import Parameters
-from beacon_comm.core.tracks import Covariance, Track, TrackChanges, Tracker, positions_at
+from beacon_comm.core.tracks import (
+    EXTENT_FALL,
+    EXTENT_RISE,
+    FIRST_SPEED_PX_PER_S,
+    FLOOR_PX,
+    SURPRISE,
+    Covariance,
+    Track,
+    TrackChanges,
+    Tracker,
+    positions_at,
+)
 
 _FEWEST_EVENTS = 4
 _SEEN_SHARE = 0.1  # of the usual events of a hop: fewer are the background's
 _SPREAD_EVENTS = 30  # fewer say nothing about the extent
-_EXTENT_RISE, _EXTENT_FALL, _EXTENT_MOVED = 0.5, 0.05, 0.2
+_EXTENT_MOVED = 0.2
 _LEAST_EXTENT_PX = 0.5
 _USUAL_GAIN = 0.1
 _HIDDEN_SHARE = 0.5  # of its radius a track moves in a hop before its events are hidden from the windows
 _HIDDEN_AFTER_HOPS = 2
-_FIRST_SPEED_PX_PER_S = 200.0
-_SURPRISE = 16.0  # a blob more than 4 standard deviations away: begin anew there
 _SAME_EXTENTS = 1.1  # two tracks of one blob are half a disc's centroids apart: 0.85 radii
 # What correlated errors make of the variance, calibrated on simulated scenes as the next ones are: errors to the other side
 # cancel for longer than one observation, errors that come again are partly followed.
@@ -126,9 +135,9 @@ class MotionTrack(Track):
         """Take an observation at ``t_ns``; one that is older than the state counts as of the state's time."""
         t_ns = max(t_ns, self.t_ns)
         x, y = self.position_at(t_ns)
-        if (x_px - x) ** 2 + (y_px - y) ** 2 > _SURPRISE * (self.variance_at(t_ns) + variance_px2):
+        if (x_px - x) ** 2 + (y_px - y) ** 2 > SURPRISE * (self.variance_at(t_ns) + variance_px2):
             speed2 = self.vx_px_per_s**2 + self.vy_px_per_s**2
-            self.begin(x_px, y_px, t_ns, variance_px2, _FIRST_SPEED_PX_PER_S**2 + speed2)
+            self.begin(x_px, y_px, t_ns, variance_px2, FIRST_SPEED_PX_PER_S**2 + speed2)
             return
         motion.observe(self.row, (t_ns - self.origin_ns) / NS_PER_S, x_px - x, y_px - y, variance_px2)
         self.settle()
@@ -271,7 +280,7 @@ class MotionTracker(Tracker):
         extent = track.extent_px
         if blob is not None:
             if blob.fresh and own < 0.5 * blob.fresh_count and track.row[HIDDEN] == 0.0:
-                track.observe(blob.x_px, blob.y_px, blob.t_ns, blob.variance_px2 + 0.05**2)
+                track.observe(blob.x_px, blob.y_px, blob.t_ns, blob.variance_px2 + FLOOR_PX**2)
                 track.last_seen_ns = max(track.last_seen_ns, blob.t_ns)
             track.index = blob.index
             extent = blob.extent_px
@@ -280,10 +289,10 @@ class MotionTracker(Tracker):
         if seen:
             track.last_seen_ns = track.origin_ns + round(float(track.row[LAST]) * NS_PER_S)
             track.row[USUAL] += _USUAL_GAIN * (own / hop_s - track.row[USUAL])
-        gain = _EXTENT_RISE if extent > track.extent_px else _EXTENT_FALL
+        gain = EXTENT_RISE if extent > track.extent_px else EXTENT_FALL
         if seen and own >= _SPREAD_EVENTS and spread < extent:
             extent = spread
-            gain = _EXTENT_RISE if extent > track.extent_px else _EXTENT_MOVED
+            gain = EXTENT_RISE if extent > track.extent_px else _EXTENT_MOVED
         track.extent_px = max(_LEAST_EXTENT_PX, track.extent_px + gain * (extent - track.extent_px))
         track.quiet = False
         track.matched_ns = t_hop_ns
@@ -348,7 +357,7 @@ class MotionTracker(Tracker):
             track_id, blob.x_px, blob.y_px, blob.t_ns, blob.extent_px, blob.index, blob.t_ns, blob.t_ns,
             matched_ns=t_hop_ns, tried_ns=tried_ns, origin_ns=t_hop_ns, latency_s=self._parameters.event_latency_s,
         )  # fmt: skip
-        track.begin(blob.x_px, blob.y_px, blob.t_ns, blob.variance_px2 + 0.05**2, _FIRST_SPEED_PX_PER_S**2)
+        track.begin(blob.x_px, blob.y_px, blob.t_ns, blob.variance_px2 + FLOOR_PX**2, FIRST_SPEED_PX_PER_S**2)
         track.row[TRUST] = 1.0
         track.row[USUAL] = blob.fresh_count / self._parameters.hop_s
         return track

@@ -32,17 +32,17 @@ from beacon_comm.core.blobs import Blob
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.parameters import Parameters
 
-_STEADY_S = 0.1  # a prediction goes on unchanged for this long …
-_FADE_S = 1.0  # … and then fades with this time constant
+STEADY_S = 0.1  # a prediction goes on unchanged for this long …
+FADE_S = 1.0  # … and then fades with this time constant
 _ACCELERATION = 400.0  # white acceleration of the filter (px²/s³): 2 px/s more uncertain after 10 ms
-_FIRST_SPEED_PX_PER_S = 200.0  # standard deviation of an unknown velocity
+FIRST_SPEED_PX_PER_S = 200.0  # standard deviation of an unknown velocity
 _KNOWN_AFTER_NS = 100_000_000  # a velocity seen for less long is not gone on with
-_FLOOR_PX = 0.05  # an observation is never better than this
-_SURPRISE = 16.0  # an innovation of more than 4 standard deviations is a manoeuvre
+FLOOR_PX = 0.05  # an observation is never better than this
+SURPRISE = 16.0  # an innovation of more than 4 standard deviations is a manoeuvre
 _NEVER = -(1 << 63)
 Covariance = tuple[tuple[float, float], tuple[float, float]]
 """((xx, xy), (xy, yy))."""
-_EXTENT_RISE, _EXTENT_FALL = 0.5, 0.05  # an extent grows at once and shrinks slowly
+EXTENT_RISE, EXTENT_FALL = 0.5, 0.05  # an extent grows at once and shrinks slowly
 
 
 @dataclass(slots=True)
@@ -86,12 +86,12 @@ class Track:
     covered_since_ns: int | None = None
     bit_rate_bps: float | None = None
     claimed_bps: float | None = None
-    variance: tuple[float, float, float] = field(default=(1.0, 0.0, _FIRST_SPEED_PX_PER_S**2))
+    variance: tuple[float, float, float] = field(default=(1.0, 0.0, FIRST_SPEED_PX_PER_S**2))
     noise: float = _ACCELERATION
 
     def position_at(self, t_ns: int) -> tuple[float, float]:
         """Return the predicted centre (px) at ``t_ns`` (ns)."""
-        s = _fading_s((t_ns - self.t_ns) / NS_PER_S)
+        s = fading_s((t_ns - self.t_ns) / NS_PER_S)
         return self.x_px + self.vx_px_per_s * s, self.y_px + self.vy_px_per_s * s
 
     def variance_at(self, t_ns: int) -> float:
@@ -118,7 +118,7 @@ class Track:
         q = _ACCELERATION
         pp, pv, vv = pp + dt * (2 * pv + dt * (vv + q * dt / 3)), pv + dt * (vv + q * dt / 2), vv + q * dt
         surprise = dx * dx + dy * dy
-        if dt > 0 and surprise > _SURPRISE * (pp + variance_px2):
+        if dt > 0 and surprise > SURPRISE * (pp + variance_px2):
             vv += surprise / dt**2
             pv += surprise / dt
             pp += surprise
@@ -335,7 +335,7 @@ class Tracker:
         return track
 
     def _make(self, track_id: int, blob: Blob, t_hop_ns: int, tried_ns: int | None) -> Track:
-        variance = (blob.variance_px2 + _FLOOR_PX**2, 0.0, _FIRST_SPEED_PX_PER_S**2)
+        variance = (blob.variance_px2 + FLOOR_PX**2, 0.0, FIRST_SPEED_PX_PER_S**2)
         return Track(
             track_id, blob.x_px, blob.y_px, blob.t_ns, blob.extent_px, blob.index, blob.t_ns, blob.t_ns,
             matched_ns=t_hop_ns, tried_ns=tried_ns, variance=variance,
@@ -348,8 +348,8 @@ def positions_at(tracks: Sequence[Track], t_ns: int) -> NDArray[np.float64]:
         return np.empty((0, 2))
     state = np.array([(t.x_px, t.y_px, t.vx_px_per_s, t.vy_px_per_s, t_ns - t.t_ns) for t in tracks])
     dt_s = state[:, 4] / NS_PER_S
-    faded = _STEADY_S - _FADE_S * np.expm1((_STEADY_S - np.maximum(dt_s, _STEADY_S)) / _FADE_S)
-    s = np.where(dt_s <= _STEADY_S, dt_s, faded)
+    faded = STEADY_S - FADE_S * np.expm1((STEADY_S - np.maximum(dt_s, STEADY_S)) / FADE_S)
+    s = np.where(dt_s <= STEADY_S, dt_s, faded)
     positions: NDArray[np.float64] = state[:, :2] + state[:, 2:4] * s[:, None]
     return positions
 
@@ -357,9 +357,9 @@ def positions_at(tracks: Sequence[Track], t_ns: int) -> NDArray[np.float64]:
 def _take(track: Track, blob: Blob, t_hop_ns: int) -> None:
     """Let a track take its blob; one without new events is seen, but tells nothing new about the position."""
     if blob.fresh:
-        track.observe(blob.x_px, blob.y_px, blob.t_ns, blob.variance_px2 + _FLOOR_PX**2)
+        track.observe(blob.x_px, blob.y_px, blob.t_ns, blob.variance_px2 + FLOOR_PX**2)
         track.last_seen_ns = blob.t_ns
-    gain = _EXTENT_RISE if blob.extent_px > track.extent_px else _EXTENT_FALL
+    gain = EXTENT_RISE if blob.extent_px > track.extent_px else EXTENT_FALL
     track.extent_px += gain * (blob.extent_px - track.extent_px)
     track.index = blob.index
     track.quiet = False
@@ -404,10 +404,11 @@ def _covering(
     return covering
 
 
-def _fading_s(dt_s: float) -> float:
-    if dt_s <= _STEADY_S:
+def fading_s(dt_s: float) -> float:
+    """Return s(dt), see the module's head."""
+    if dt_s <= STEADY_S:
         return dt_s
-    return _STEADY_S + _FADE_S * (1.0 - math.exp((_STEADY_S - dt_s) / _FADE_S))
+    return STEADY_S + FADE_S * (1.0 - math.exp((STEADY_S - dt_s) / FADE_S))
 
 
 @njit(cache=True, nogil=True)
