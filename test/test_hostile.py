@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from test_docs_scripts import DOCS, load
+from docs_script import DOCS, load
 
 fuzz = load('fuzz')
 endurance = load('endurance')
