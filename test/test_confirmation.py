@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beacon_comm.core.character import Character, Status
-from beacon_comm.core.confirmation import ParityRecord, Verdict, comb_share, regular_share, repeats
+from beacon_comm.core.confirmation import ParityRecord, Verdict, comb_share, equal_share, regular_share, repeats
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.parameters import Parameters
 
@@ -352,6 +352,32 @@ def test_a_window_on_a_comb_that_is_not_quite_sharp_needs_a_second_one() -> None
         record = ParityRecord(Parameters(confirm_regular=1.0))
         read = [replace(character, confidence=confidence) for character in characters(codes)]
         assert sorted(verdicts(record, read)) == confirmed_at, confidence
+
+
+@pytest.mark.parametrize('codes', ['oooo{{{{\x03x', 'mmmmoooii{'])
+def test_few_codes_on_a_comb_are_refused_where_edges_stray(codes: str) -> None:
+    """What was once confirmed of two lamps, and of bars that pass: sure characters, but all falls on a comb."""
+    read = [codes[k] for k in np.random.default_rng(1).integers(len(codes), size=200)]
+    assert comb_share([FRAME.frame_of(ord(letter)) for letter in read], FRAME.length) == 1.0
+    assert equal_share([ord(letter) for letter in read]) > 0.2
+    for spread, confirmed in ((0.12, False), (0.02, True)):
+        record = ParityRecord(Parameters())
+        verdicts(record, (replace(character, edge_spread=spread) for character in characters(read)))
+        assert record.confirmed is confirmed
+
+
+def test_a_blurred_beacon_is_confirmed_all_the_same() -> None:
+    for text in (TEXT, 'ID017 ' * 10, '0042 ' * 12, 'ID000042 ' * 8):
+        record = ParityRecord(Parameters())
+        verdicts(record, (replace(character, edge_spread=0.18) for character in characters(text)))
+        assert record.confirmed, text
+
+
+def test_equal_share_of_pairs() -> None:
+    assert equal_share([1, 1, 1]) == 1.0
+    assert equal_share([1, 1, 2, 2]) == pytest.approx(2 / 6)
+    assert equal_share([1, 2, 3]) == 0.0
+    assert equal_share([1]) == equal_share([]) == 1.0
 
 
 # Other frames

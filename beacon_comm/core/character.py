@@ -33,6 +33,8 @@ class Character:
         bit_rate_bps: rate at which it was decoded (bit/s).
         bit_llr: log-likelihood ratio of each bit of the frame without the frame's structure (nat, positive: 1), in the
             order they are sent; empty from the threshold receiver.
+        edge_spread: standard deviation of the edges about where the bit clock has them (bit); 0 from the threshold receiver,
+            whose confidence says as much.
     """
 
     t_ns: int
@@ -42,6 +44,7 @@ class Character:
     frame: int
     bit_rate_bps: float
     bit_llr: tuple[float, ...] = ()
+    edge_spread: float = 0.0
 
     @property
     def read_freely(self) -> bool:

@@ -17,7 +17,7 @@ of the bits than to their middles (their confidence); and their codes have to va
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -34,6 +34,9 @@ from beacon_comm.core.parameters import Parameters
 
 SLIPPED_BITS = 0.5
 """A character that starts so many bits too early has slipped: the line was not synchronised before it."""
+
+VOUCHED_WINDOWS = 4
+"""A record remembers what vouched for as long as so many windows."""
 
 
 class Verdict(Enum):
@@ -53,6 +56,7 @@ class _Counted:
     code: int
     frame: int
     confidence: float
+    edge_spread: float
     vouches: bool
 
 
@@ -99,6 +103,7 @@ class ParityRecord:
         self.confirmed_at_ns: int | None = None
         self._rights: deque[bool] = deque(maxlen=parameters.judged_last)
         self._window: deque[_Counted] = deque(maxlen=parameters.confirm_window)
+        self._vouched: deque[_Counted] = deque(maxlen=VOUCHED_WINDOWS * parameters.confirm_window)
         self._last_start_ns: int | None = None
         self._failures = 0  # characters in a row at which the last parities failed a confirmed beacon
         self._doubtful_at: int | None = None  # number of the character at which a window first passed in doubt
@@ -159,7 +164,10 @@ class ParityRecord:
             or (status is Status.REPAIRED and character.read_freely)
         )
         vouches = status is Status.OK and not self._slipped(character)
-        self._window.append(_Counted(character.code, character.frame, character.confidence, vouches))
+        counted = _Counted(character.code, character.frame, character.confidence, character.edge_spread, vouches)
+        self._window.append(counted)
+        if vouches:
+            self._vouched.append(counted)
         self._last_start_ns = character.t_ns
 
     def _slipped(self, character: Character) -> bool:
@@ -196,7 +204,9 @@ class ParityRecord:
         """Tell whether a window that passes otherwise may be light that only repeats.
 
         One that lies on a comb is a lamp's where it is blurred; where it is not quite sharp, one such window may be a
-        lamp's by chance, and another one is asked for that has no character in common with it.
+        lamp's by chance, and another one is asked for that has no character in common with it.  The same is asked where
+        the edges stray from the borders of the bits; and what such a line has said so far must not be a few codes again
+        and again, on a comb least of all.
         """
         p = self._p
         codes = [counted.code if counted.vouches else None for counted in self._window]
@@ -205,9 +215,16 @@ class ParityRecord:
         frames = [counted.frame for counted in vouching]
         if regular_share(frames, self._layout.length) > p.confirm_regular:
             return True
-        if confidence >= p.confirm_sure or comb_share(frames, self._layout.length) <= p.confirm_comb:
+        if median(counted.edge_spread for counted in vouching) > p.confirm_edge_spread:
+            equal = equal_share([counted.code for counted in self._vouched])
+            frames = [counted.frame for counted in self._vouched]
+            if equal > p.confirm_equal:
+                return True
+            if equal > p.confirm_equal_on_comb and comb_share(frames, self._layout.length) > p.confirm_comb:
+                return True
+        elif confidence >= p.confirm_sure or comb_share(frames, self._layout.length) <= p.confirm_comb:
             return False
-        if confidence < p.confirm_sharp:
+        elif confidence < p.confirm_sharp:
             return True
         if self._doubtful_at is None:
             self._doubtful_at = self.characters
@@ -228,6 +245,12 @@ def repeats(codes: Sequence[int | None], period: int, share: float) -> bool:
         if early is not None and late is not None
     ]
     return sum(pairs) > share * len(pairs)
+
+
+def equal_share(codes: Sequence[int]) -> float:
+    """Return the share of all pairs of codes that are equal (Friedman's index of coincidence): a text's is about 0.07."""
+    pairs = len(codes) * (len(codes) - 1)
+    return sum(count * (count - 1) for count in Counter(codes).values()) / pairs if pairs else 1.0
 
 
 def regular_share(frames: Sequence[int], length: int) -> float:

@@ -41,6 +41,7 @@ from beacon_comm.core.sequence_detection import (
     LOST_IN_GAP,
     MARGIN,
     PERIOD_THEN,
+    SPREAD_THEN,
     STILL_LOCKED,
     WORD,
     detect,
@@ -270,6 +271,7 @@ class SequenceDemodulator:
             frame=word,
             bit_rate_bps=NS_PER_S / period,
             bit_llr=tuple(row[FIRST_RATIO:].tolist()),
+            edge_spread=float(row[SPREAD_THEN]),
         )
 
     # Searching

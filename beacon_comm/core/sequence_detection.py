@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from beacon_comm.core.bit_clock import BORDER, EDGE_LAG, P_PHASE, PERIOD, go_on, see_edge, take_events
+from beacon_comm.core.bit_clock import BORDER, EDGE_LAG, P_PHASE, PERIOD, VARIANCE, go_on, see_edge, take_events
 from beacon_comm.core.likelihood import CONTEXTS, COUNTS, LEVELS, MEMORY_BITS, SUB_SLOTS, learn, logarithms, weigh
 from beacon_comm.core.soft_decision import bit_ratios, margins
 from beacon_comm.core.trellis import NOISE_COST, UNLIKELY, framed_step, free_step
@@ -104,7 +104,7 @@ HEARD, SILENT, MISSING = range(3)
 BIT, LEARNT, NEXT_TABLES, NOISE_RUN, DOUBT, SILENT_RUN, ASLEEP, BEGUN = range(8)
 
 # What a row of words tells.
-WORD, KIND, BORDER_OF_START, MARGIN, PERIOD_THEN, FIRST_RATIO = range(6)
+WORD, KIND, BORDER_OF_START, MARGIN, PERIOD_THEN, SPREAD_THEN, FIRST_RATIO = range(7)
 KIND_OK, KIND_SEEN, KIND_REPAIRED, KIND_NOISE, KIND_UNREADABLE = range(5)
 STILL_LOCKED, LOST, LOST_IN_GAP, FULL = range(4)
 
@@ -444,6 +444,7 @@ def _decide_word(clock, state, layout, length, best, at, lag, row):  # type: ign
             state.levels[USUAL] += (fit - state.levels[USUAL]) / LEARNING_MEMORY
     clock.frozen[0] = not passes
     row[WORD], row[MARGIN], row[PERIOD_THEN] = word, margin, clock.values[PERIOD]
+    row[SPREAD_THEN] = np.sqrt(clock.values[VARIANCE])
     if passes and margin >= SEEN_MARGIN:
         row[KIND] = KIND_OK if margin >= OK_MARGIN else KIND_SEEN
     else:
