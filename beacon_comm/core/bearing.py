@@ -33,6 +33,7 @@ _COEFFICIENTS = {'plumb_bob': (0, 4, 5), 'rational_polynomial': (8, 12, 14), 'eq
 _STEP_PX = 0.01  # of the Jacobian's central difference: far above rounding, far below any curvature of a lens
 _NEWTON_STEPS = 8
 _SOLVED_PX = 1e-3  # a solution projects back this close
+_EXACT_PX = 1e-9
 _PLANE_STEP = 1e-6
 _PLANE_STEPS = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)]) * _PLANE_STEP
 
@@ -133,9 +134,11 @@ class CameraModel:
         """
         plane = cv2.undistortPoints(pixels.reshape(-1, 1, 2), self.k, self.d).reshape(-1, 2)
         for _ in range(_NEWTON_STEPS):
+            error = pixels - self._projected(plane)
+            if np.all(np.abs(error) < _EXACT_PX):  # at once where there is no distortion
+                break
             right, left, below, above = (self._projected(plane + step) for step in _PLANE_STEPS)
             jacobian = np.stack((right - left, below - above), axis=2) / (2 * _PLANE_STEP)
-            error = pixels - self._projected(plane)
             determinant = np.linalg.det(jacobian)
             solvable = np.isfinite(determinant) & (determinant > 0)
             plane[solvable] += np.linalg.solve(jacobian[solvable], error[solvable, :, None])[:, :, 0]
