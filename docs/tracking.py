@@ -2,7 +2,7 @@
 """Measure tracking on simulated scenes: speed, crossings, many beacons, occlusion, a shaken camera, and the errors' truth.
 
     python docs/tracking.py --write            # docs/tracking.md and its figure; some minutes
-    python docs/tracking.py --full --write     # as many characters and runs as issue 4 asks for; an hour
+    python docs/tracking.py --full --write     # at least 1000 characters a point and 100 runs; an hour
     python docs/tracking.py --only crossings --runs 100
 
 ::
@@ -53,8 +53,8 @@ Simulated = tuple[Iterator[EventBatch], SceneTruth]
 
 
 def parameters(**changes: Any) -> Parameters:
-    """Return the defaults with the scenes' bit rate listed and the motion tracker, but for the changes."""
-    return Parameters(**{'bit_rates': (BIT_RATE,), 'tracker': 'motion', **changes})
+    """Return the defaults with the scenes' bit rate listed, but for the changes."""
+    return Parameters(**{'bit_rates': (BIT_RATE,), **changes})
 
 
 def scene(paths: list[dict[str, Any]], duration_s: float, seed: int, **content: Any) -> Simulated:
@@ -403,8 +403,8 @@ HEAD = """# Tracking
 
 Written by `COMMAND` on simulated scenes ([docs/simulator.md](simulator.md)): 640 × 480, beacons of 1 kbps, default parameters
 with the bit rate listed. `motion` follows tracks by their own events ([following.py](../beacon_comm/core/following.py),
-[motion.py](../beacon_comm/core/motion.py), [motion_tracks.py](../beacon_comm/core/motion_tracks.py)); `nearest` is the paper's,
-and the default.
+[motion.py](../beacon_comm/core/motion.py), [motion_tracks.py](../beacon_comm/core/motion_tracks.py)) and is the default;
+`nearest` is the paper's.
 """
 SPEEDS = """Slow until locked, then ramped up to the speed; a straight line that turns back at the borders, scored from 10 ms
 after each turn, and a circle of 200 px radius. In parentheses: 95 % intervals (Wilson).
@@ -450,7 +450,7 @@ def draw(found: dict[str, Any], path: Path) -> None:
 def main() -> int:
     """Measure, print, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else '')
-    parser.add_argument('--full', action='store_true', help='as many characters and runs as issue 4 asks for')
+    parser.add_argument('--full', action='store_true', help='at least 1000 characters a point and 100 runs')
     parser.add_argument('--only', choices=list(PARTS), action='append', help='only this part (may be given again)')
     parser.add_argument('--runs', type=int, help='crossings: so many')
     parser.add_argument('--write', action='store_true', help='write tracking.md, .json, the figure; other parts stay')

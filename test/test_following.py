@@ -219,3 +219,20 @@ def test_hops_without_any_event_cost_no_track_its_velocity_at_once() -> None:
     detect(detector, along(path, 0.0, 0.3))
     detector.hop((T0_NS + 340_000_000) // HOP_NS * HOP_NS)
     assert detector.tracks[1].position_at(T0_NS + 340_000_000)[0] == pytest.approx(40.0 + 0.34 * 400.0, abs=3.0)
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_edges_that_pass_do_not_take_a_beacon_along(seed: int) -> None:
+    """What is read has the events in its circle before what nobody can read."""
+    detector = Detector(Parameters(bit_rates=(1000.0,), tracker='motion'), SIZE)
+    beacon = along(still(160.0, 120.0), 0.0, 0.6, seed, rate_per_s=30_000.0)
+    edges = [
+        along(lambda t_s, y=y: (20.0 + 1500.0 * (t_s - 0.2), np.full(len(t_s), y)), 0.2, 0.4, 10 * seed + k, 60_000.0)
+        for k, y in enumerate((110.0, 118.0, 126.0))
+    ]
+
+    def look(t_hop: int, changes: object) -> None:
+        detector.tracks[1].bit_rate_bps = 1000.0
+
+    detect(detector, merged(beacon, *edges), look)
+    assert detector.tracks[1].position_at(T0_NS + 600_000_000) == pytest.approx((160.0, 120.0), abs=1.0)

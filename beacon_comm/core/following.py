@@ -4,7 +4,9 @@
     events   · ·· ····|· · ····· |·
     update        ^      ^   ^               every 48 events of a track: residual to its path ─► motion filter ─► new path
 
-An event is of the nearest track whose circle holds it, both at the event's own time.  The circle grows by what is unknown:
+An event is of the nearest track whose circle holds it, both at the event's own time.  A quiet track, of which only a
+prediction is left, gives way to one with events, and one that nobody can read to one whose bit rate is known: edges that
+pass a beacon would push it away.  The circle grows by what is unknown:
 
     radius = extent × routing_extent_factor + routing_margin_px + 3 σ + 2 |v| (time since the last update), bounded
 
@@ -115,6 +117,7 @@ class FollowingRouter(Router):
             self._state[k] = track.aimed(t_hop_ns)
             track.row = self._state[k]
         self._path = np.zeros((len(followed), 10))
+        self._rank = np.array([2 * (not track.quiet) + (track.bit_rate_bps is not None) for track in followed], np.int64)
         self._partner = np.full(len(followed), -1)
         self._step = np.full(1, -1)
         self._hidden = bool((self._state[:, HIDDEN] > 0).any())
@@ -124,8 +127,8 @@ class FollowingRouter(Router):
         width, height = self._grid.width, self._grid.height
         routed, self._first, self._member = _follow(
             segment.x, segment.y, segment.polarity, segment.t_ns, self._t_hop_ns, self._step_ns, self._step,
-            self._state, self._path, self._partner, self._first, self._member, width, height, self._factor, self._margin,
-            self._index, self._owner, code, count,
+            self._state, self._path, self._rank, self._partner, self._first, self._member, width, height,
+            self._factor, self._margin, self._index, self._owner, code, count,
         )  # fmt: skip
         return int(routed)
 
@@ -149,7 +152,7 @@ class FollowingRouter(Router):
 
 @njit(cache=True, nogil=True)
 def _follow(  # type: ignore[no-untyped-def]
-    x, y, polarity, t_ns, t_hop_ns, step_ns, step, state, path, partner, first, member, width, height, factor, margin,
+    x, y, polarity, t_ns, t_hop_ns, step_ns, step, state, path, rank, partner, first, member, width, height, factor, margin,
     index, owner, code, count,
 ):  # fmt: skip
     """List the events that are of a track, with their tracks; move the tracks on; return how many, and the cells' lists."""
@@ -166,7 +169,7 @@ def _follow(  # type: ignore[no-untyped-def]
             for k in range(len(state)):
                 _lay(state[k], path[k], begin_s, step_s, factor, margin)
                 fits = fits and _is_in_box(path[k], step_s)
-            _find_partners(path, state, partner)
+            _find_partners(path, rank, state, partner)
             if not fits:
                 first, member = _list_paths(path, step_s, width, height, across, down)
         stop = i + np.searchsorted(t_ns[i:], t_hop_ns + (now + 1) * step_ns)
@@ -182,14 +185,15 @@ def _follow(  # type: ignore[no-untyped-def]
             cell = cell_of(x[e], y[e], across)
             t_s = (t_ns[e] - t_hop_ns) * 1e-9
             ex, ey, dt = np.float64(x[e]), np.float64(y[e]), t_s - begin_s
-            nearest2, best, best_x, best_y = np.inf, np.int64(-1), 0.0, 0.0
+            nearest2, best, highest, best_x, best_y = np.inf, np.int64(-1), np.int64(-1), 0.0, 0.0
             for m in range(np.uint64(first[cell]), np.uint64(first[cell + np.uint64(1)])):
                 one_of = np.int64(member[m])
                 dx = ex - (path[one_of, _PX] + path[one_of, _PVX] * dt)
                 dy = ey - (path[one_of, _PY] + path[one_of, _PVY] * dt)
                 d2 = dx * dx + dy * dy
-                if d2 <= path[one_of, _RR] and d2 < nearest2:
-                    nearest2, best, best_x, best_y = d2, one_of, dx, dy
+                above = rank[one_of] - highest
+                if d2 <= path[one_of, _RR] and (above > 0 or (above == 0 and d2 < nearest2)):
+                    nearest2, best, highest, best_x, best_y = d2, one_of, rank[one_of], dx, dy
             if best < 0:
                 continue
             row = state[best]
@@ -270,13 +274,15 @@ def _is_in_box(path, step_s):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _find_partners(path, state, partner):  # type: ignore[no-untyped-def]
-    """Find for each track the nearest one whose events may be nearer to it, -1: none."""
+def _find_partners(path, rank, state, partner):  # type: ignore[no-untyped-def]
+    """Find for each track the nearest one of its rank whose events may be nearer to it, -1: none."""
     m = len(path)
     nearest2 = np.full(m, np.inf)
     partner[:] = -1
     for a in range(m):
         for b in range(a + 1, m):
+            if rank[a] != rank[b]:
+                continue
             dx, dy = path[a, _PX] - path[b, _PX], path[a, _PY] - path[b, _PY]
             reach = 2.0 * min(state[a, EXTENT], state[b, EXTENT]) + 1.0
             d2 = dx * dx + dy * dy

@@ -8,6 +8,9 @@
 The paper's index of a track is that of a pixel moved along: its events over its area in windows that forget like the
 detection's short and long one, so that a fast one has an index, too.
 
+Edges that pass over a beacon may drag its track away.  One whose velocity has jumped remembers for a while where it was
+before (:class:`Steady`): if something is seen where it would be by now, and nobody else's, that is it.
+
 A label comes back only to what is where the lost track may be; when its bit rate is known and is another one, it goes on
 under a label of its own (:meth:`MotionTracker.disown`).
 """
@@ -71,9 +74,32 @@ _SAME_EXTENTS = 1.1  # two tracks of one blob are half a disc's centroids apart:
 # cancel for longer than one observation, errors that come again are partly followed.
 _CANCEL, _REPEAT = 4.2, 0.25
 _LEAST_SHARE = 0.1
+_JUMP_PX_PER_S, _JUMP_SHARE = 300.0, 0.3  # a velocity jumps by more than so much and this share of it …
+_JUMPED_S = 0.1  # … and what was before is remembered for so long
 _GRAIN_PX = 0.02  # a spot's centroid is off by so much because its pixels differ
 _GRAIN_SPEED_PX_PER_S = 50.0  # at this speed half of that is averaged out: a pixel in the filter's memory
 _LATENCY_SHARE = 0.25  # of the latency is its standard deviation
+
+
+@dataclass(frozen=True, slots=True)
+class Steady:
+    """Where a track was when its velocity was last steady: centre (px) and velocity (px/s) at a time (ns)."""
+
+    x_px: float
+    y_px: float
+    vx_px_per_s: float
+    vy_px_per_s: float
+    t_ns: int
+
+    def position_at(self, t_ns: int) -> tuple[float, float]:
+        """Return where it would be at ``t_ns`` (ns)."""
+        dt = (t_ns - self.t_ns) / NS_PER_S
+        return self.x_px + self.vx_px_per_s * dt, self.y_px + self.vy_px_per_s * dt
+
+    def fits(self, track: Track) -> bool:
+        """Return whether a track moves much like it."""
+        jump = math.hypot(track.vx_px_per_s - self.vx_px_per_s, track.vy_px_per_s - self.vy_px_per_s)
+        return jump <= _JUMP_PX_PER_S + _JUMP_SHARE * math.hypot(self.vx_px_per_s, self.vy_px_per_s)
 
 
 @dataclass(slots=True)
@@ -81,6 +107,7 @@ class MotionTrack(Track):
     """A track with a motion filter.
 
     Attributes:
+        steady: where it was at the last hop, or before its velocity jumped; None: it has not been read.
         row: its state, see :mod:`.motion`.
         origin_ns: the hop that the row's times count from (ns).
         latency_s: of the sensor (s): how much later than the light an event is.
@@ -89,6 +116,7 @@ class MotionTrack(Track):
     row: NDArray[np.float64] = field(default_factory=lambda: np.zeros(motion.WIDTH))
     origin_ns: int = 0
     latency_s: float = 0.0
+    steady: Steady | None = None
 
     def aimed(self, t_hop_ns: int) -> NDArray[np.float64]:
         """Return the row for the hop interval that begins at ``t_hop_ns`` (ns), with the hop's sums at zero."""
@@ -148,6 +176,21 @@ class MotionTrack(Track):
         self.settle()
         self.quiet = True
 
+    def jumped(self, t_hop_ns: int) -> Steady | None:
+        """Return the state before its velocity jumped, not long before ``t_hop_ns`` (ns), None: it has not."""
+        before = self.steady
+        if before is None or t_hop_ns - before.t_ns >= _JUMPED_S * NS_PER_S:
+            return None
+        return None if before.fits(self) else before
+
+    def return_to(self, x_px: float, y_px: float, t_ns: int, variance_px2: float) -> None:
+        """Be at a place again at ``t_ns`` (ns), with the velocity from before the jump."""
+        if self.steady is not None:
+            vx, vy = self.steady.vx_px_per_s, self.steady.vy_px_per_s
+            motion.begin(self.row, (t_ns - self.origin_ns) / NS_PER_S, x_px, y_px, vx, vy, variance_px2, _JUMP_PX_PER_S**2)
+            self.settle()
+            self.steady = Steady(x_px, y_px, vx, vy, t_ns)
+
     def stop(self, x_px: float, y_px: float, t_ns: int) -> None:
         """Wait at a place from ``t_ns`` (ns) on."""
         self.begin(x_px, y_px, t_ns, self.variance[0], self.variance[2])
@@ -193,7 +236,7 @@ class MotionTracker(Tracker):
         for track in lost:
             del self._tracks[track.track_id]
         self._remember(lost, t_hop_ns)
-        left = self._unfollowed(tracks, blobs, track_of, t_hop_ns)
+        left = self._return(tracks, blobs, self._unfollowed(tracks, blobs, track_of, t_hop_ns), t_hop_ns)
         return self._rename(self._begin(left, blobs, lost, t_hop_ns))
 
     def clear(self, sensor_size: tuple[int, int]) -> TrackChanges:
@@ -341,6 +384,44 @@ class MotionTracker(Tracker):
                 track.covered_since_ns = None
             elif track.covered_since_ns is None:
                 track.covered_since_ns = t_hop_ns
+
+    def _return(
+        self, tracks: list[MotionTrack], blobs: Sequence[Blob], left: list[tuple[int, int]], t_hop_ns: int
+    ) -> list[tuple[int, int]]:
+        """Let tracks that were dragged away return to a blob that is left over where they would be; return the other blobs."""
+        gate = self._parameters.association_gate_px
+        for track in tracks:
+            if track.bit_rate_bps is None or track.track_id not in self._tracks:
+                continue
+            before = track.jumped(t_hop_ns)
+            if before is None:
+                here = track.position_at(t_hop_ns)
+                track.steady = Steady(*here, track.vx_px_per_s, track.vy_px_per_s, t_hop_ns)
+                continue
+            for entry in left:
+                blob = blobs[entry[1]]
+                if math.dist(before.position_at(blob.t_ns), (blob.x_px, blob.y_px)) <= gate:
+                    track.return_to(blob.x_px, blob.y_px, blob.t_ns, blob.variance_px2 + FLOOR_PX**2)
+                    left = [other for other in left if other is not entry]
+                    break
+            else:
+                for other in tracks:
+                    near = math.dist(before.position_at(t_hop_ns), other.position_at(t_hop_ns)) <= other.extent_px + gate
+                    if near and not other.quiet and other.bit_rate_bps is None and before.fits(other):
+                        self._exchange(track, other)
+                        break
+        return left
+
+    def _exchange(self, track: MotionTrack, other: MotionTrack) -> None:
+        """Let two tracks go on where the other one was."""
+        track.row, other.row = other.row.copy(), track.row.copy()
+        track.origin_ns, other.origin_ns = other.origin_ns, track.origin_ns
+        for name in ('extent_px', 'index', 'last_seen_ns', 'matched_ns', 'quiet'):
+            mine, its = getattr(track, name), getattr(other, name)
+            setattr(track, name, its)
+            setattr(other, name, mine)
+        track.settle()
+        other.settle()
 
     def _take_over(self, older: MotionTrack, younger: MotionTrack) -> None:
         """Let a quiet track go on where a younger one is."""

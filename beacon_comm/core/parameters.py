@@ -202,7 +202,7 @@ class Parameters(Declared):
 
     # Tracks
     tracker: str = parameter(
-        'nearest',
+        'motion',
         "nearest: blobs' nearest neighbours at hops, the paper's; motion: tracks move on with their own events, filtered",
         choices=('nearest', 'motion'),
     )
