@@ -421,6 +421,36 @@ def test_batches_of_equal_time_give_the_same_characters(whole, rates, search, st
     assert decode(demodulator(*rates, search=search), t_ns, polarity, cuts=cuts) == whole(0, rates, search)
 
 
+@pytest.mark.parametrize('step_ns', [1_000_000, 10_000_000, 250_000_000])
+@pytest.mark.parametrize(('rates', 'search'), SEARCHES[1:])
+def test_batches_give_the_same_characters_where_little_is_spent_on_searching(rates, search, step_ns):
+    t_ns, polarity = hard_stream(0)
+    cuts = range(int(t_ns[0]) - 10 * step_ns, int(t_ns[-1]) + NS // 2, step_ns)
+    expected = decode(demodulator(*rates, search=search, search_load=0.02), t_ns, polarity)
+    assert decode(demodulator(*rates, search=search, search_load=0.02), t_ns, polarity, cuts=cuts) == expected
+
+
+def test_where_little_is_spent_on_searching_a_beacon_is_found_later():
+    t_ns, polarity = beacon_events(text_bits(PROSE * 5), 1250.0)
+    known = []
+    for load in (0.02, 1.0):
+        receiver, found_ns = demodulator(504.0, 3125.0, search='both', search_load=load), None
+        for cut_ns in range(0, int(t_ns[-1]), 10_000_000):
+            part = slice(*np.searchsorted(t_ns, (cut_ns, cut_ns + 10_000_000)))
+            receiver.push(t_ns[part], polarity[part], cut_ns + 10_000_000)
+            if found_ns is None and receiver.bit_rate_bps is not None:
+                found_ns = cut_ns
+        known.append(found_ns)
+    assert None not in known and known[0] > known[1]
+
+
+def test_what_was_searched_before_is_read_when_a_beacon_is_found():
+    t_ns, polarity = beacon_events(text_bits(PROSE), 1000.0)
+    receiver = demodulator(1000.0)
+    receiver.searched(int(t_ns[len(t_ns) // 2]))
+    assert text_of(decode(receiver, t_ns, polarity)) == PROSE
+
+
 def test_one_event_at_a_time_gives_the_same_characters():
     t_ns, polarity = beacon_events(text_bits(PROSE[:30]), 3125.0)
     expected = decode(demodulator(3125.0), t_ns, polarity)

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from beacon_comm.core.character import Character
 from beacon_comm.core.confirmation import ParityRecord
-from beacon_comm.core.demodulator import Demodulator, GapAware
+from beacon_comm.core.demodulator import Demodulator, GapAware, Searching
 from beacon_comm.core.event_buffer import buffer_length_ns
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.parameters import Parameters
@@ -157,6 +157,7 @@ class CandidateSlots:
         self._tried: dict[int, _Tried] = {}
         self._slots_full = False
         self._gaps = Gaps(2 * buffer_length_ns(parameters))
+        self._search_share = parameters.search_load
 
     def miss(self, start_ns: int, stop_ns: int) -> None:
         """Hear that the events of the stream from ``start_ns``, up to which it is known, to ``stop_ns`` (ns) are missing."""
@@ -193,6 +194,7 @@ class CandidateSlots:
         queue = self._queue(tracks)
         self._end_turns_that_are_over(t_ns, len(queue) - self._free)
         given = queue[: self._free]
+        self._share_search_load(len(given))
         self._slots_full = len(queue) > len(given)
         received = []
         for track_id in given:
@@ -310,6 +312,17 @@ class CandidateSlots:
         slot = self._slots.pop(track_id)
         self._tried[track_id] = _Tried(t_ns, slot.record, slot.read_to_ns)
 
+    def _share_search_load(self, more: int) -> None:
+        """Share what may be spent on searching among the slots without a bit rate, and so many more that are given now."""
+        searching = [
+            slot.demodulator
+            for slot in self._slots.values()
+            if isinstance(slot.demodulator, Searching) and slot.demodulator.bit_rate_bps is None
+        ]
+        self._search_share = self._p.search_load / max(1, len(searching) + more)
+        for demodulator in searching:
+            demodulator.share(self._search_share)
+
     def _give(self, track_id: int, t_ns: int, times: Times, polarity: Polarities) -> list[ReceivedCharacter]:
         tried = self._tried.pop(track_id, None)
         read_to_ns = None if tried is None else tried.read_to_ns
@@ -317,6 +330,10 @@ class CandidateSlots:
         slot = _Slot(self._make_demodulator(self._p), ParityRecord(self._p), self._gaps, read_to_ns)
         self._slots[track_id] = slot
         slot.record.advance(t_ns, quiet=False)
+        if isinstance(slot.demodulator, Searching):
+            slot.demodulator.share(self._search_share)
+            if tried is not None:
+                slot.demodulator.searched(tried.ended_ns)
         received = []
         for start_ns, stop_ns in self._gaps.since(int(times[first])) if first < len(times) else ():
             stop = max(first, int(np.searchsorted(times, start_ns, 'right')))

@@ -13,7 +13,15 @@ from beacon_comm.core.rate_bank import RateBank
 from beacon_comm.core.sequence import SequenceDemodulator
 from beacon_comm.core.threshold import ThresholdDemodulator
 
-__all__ = ['Demodulator', 'GapAware', 'RateBank', 'SequenceDemodulator', 'ThresholdDemodulator', 'make_demodulator']
+__all__ = [
+    'Demodulator',
+    'GapAware',
+    'RateBank',
+    'Searching',
+    'SequenceDemodulator',
+    'ThresholdDemodulator',
+    'make_demodulator',
+]
 
 
 class Demodulator(Protocol):
@@ -58,6 +66,19 @@ class GapAware(Protocol):
 
         Characters that overlap it need not be held back: the slot erases them.
         """
+        ...
+
+
+@runtime_checkable
+class Searching(Protocol):
+    """A demodulator that looks for the bit rate again and again, at a cost."""
+
+    def share(self, load: float) -> None:
+        """Spend from now on no more computing time per event time on it; 1: one core."""
+        ...
+
+    def searched(self, to_ns: int) -> None:
+        """Hear, before the first events, that those before ``to_ns`` (ns) have been searched: read them, if need be."""
         ...
 
 

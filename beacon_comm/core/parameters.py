@@ -153,6 +153,9 @@ class Parameters(Declared):
         'sequence: look for the listed bit rates, for any from 100 bps to 10 kbps (blind), or first for the listed ones',
         choices=('both', 'listed', 'blind'),
     )
+    search_load: float = parameter(
+        0.5, 'sequence: computing time that all candidates may spend on looking for their bit rates (1: a core)', '', 0.01
+    )
     cutoff_per_bit: float = parameter(
         2.0 * math.pi / 3.0,
         "high-pass cut-off alpha over the bit rate (2π/3: the paper's released script; 1/3: the paper's text)",

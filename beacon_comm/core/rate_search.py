@@ -92,6 +92,7 @@ class RateSearch:
         demands: what a lock has to show.
         most_step: attempts are at most so many characters apart.
         longest: events so far back may still be needed (ns).
+        wanted: when the next attempt was to be made, had it not been postponed (ns).
     """
 
     def __init__(self, bit_rate_bps: float, frame: CharacterFrame, demands: Demands, attempts: tuple[int, ...]) -> None:
@@ -109,6 +110,7 @@ class RateSearch:
         self._made = 0
         self._since = t
         self._at = float(self._attempts[0])
+        self.wanted = self.due
 
     @property
     def due(self) -> float:
@@ -146,13 +148,18 @@ class RateSearch:
         """Yield groups of periods (ns) to try on a window of events, the likeliest first."""
         raise NotImplementedError
 
+    def postpone(self, t: float) -> None:
+        """Make the next attempt at ``t`` (ns)."""
+        self._at = max(self._at, (t - self._since) / self._character)
+
     def failed(self) -> None:
         """Go on to the next attempt."""
         self._made += 1
         if self._made < len(self._attempts):
-            self._at = float(self._attempts[self._made])
+            self._at = max(float(self._attempts[self._made]), self._at + 1.0)
         else:
             self._at += min(max(LATER_STEP, self._at * LATER_SHARE), self.most_step)
+        self.wanted = self.due
 
 
 class ListedSearch(RateSearch):

@@ -27,6 +27,7 @@ from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.likelihood import MEMORY_BITS, compression_table
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.rate_search import RateSearch, make_searches
+from beacon_comm.core.search_budget import SearchBudget
 from beacon_comm.core.sequence_detection import (
     BORDER_OF_START,
     FIRST_RATIO,
@@ -98,6 +99,8 @@ class SequenceDemodulator:
         self._refine_at = math.inf  # time at which the lock is to be refined
         self._usable_from = -math.inf  # events before this are not read again
         self._found_at = -math.inf  # when the lock was found
+        self._searched_to_ns: int | None = None  # by the demodulator before this one
+        self._budget = SearchBudget(parameters.search_load)
 
     @property
     def _t(self) -> NDArray[np.float64]:
@@ -134,7 +137,7 @@ class SequenceDemodulator:
             if not len(t_ns):
                 return []
             self._origin_ns = int(t_ns[0])
-            self._restart(0.0)
+            self._restart(0.0 if self._searched_to_ns is None else max(0.0, float(self._searched_to_ns - self._origin_ns)))
         self._ended = None
         self._events.append(t_ns - self._origin_ns, polarity)
         t_end = float(t_end_ns - self._origin_ns)
@@ -156,6 +159,14 @@ class SequenceDemodulator:
         self._forget(t_end)
         self._known_to = t_end
         return characters
+
+    def share(self, load: float) -> None:
+        """Spend no more on searching; see :class:`beacon_comm.core.demodulator.Searching`."""
+        self._budget.set_load(load, max(self._known_to, 0.0))
+
+    def searched(self, to_ns: int) -> None:
+        """Hear of searched events; see :class:`beacon_comm.core.demodulator.Searching`."""
+        self._searched_to_ns = to_ns
 
     def miss(self, start_ns: int, stop_ns: int) -> None:
         """Hear of missing events; see :class:`beacon_comm.core.demodulator.GapAware`."""
@@ -278,16 +289,21 @@ class SequenceDemodulator:
 
     def _attempt(self, t_end: float) -> bool:
         """Make the attempt that is due next, if its time has come; return whether one was made."""
-        search = min(self._searches, key=lambda search: search.due)
+        search = min(self._searches, key=lambda search: (search.due, search.wanted))
         now = search.due
         if not now <= t_end:
             return False
+        ready = self._budget.ready_at(now)
+        if ready > now + 1.0:  # ns, beyond rounding
+            search.postpone(ready)
+            return True
         stop = int(np.searchsorted(self._t, now))
         first = max(int(np.searchsorted(self._t, self._usable_from)), stop - self._most_events)
         window = search.window(self._t, now, first, stop)
         if window is None:  # nothing there: wait for the next event
             search.restart(float(self._t[stop]) if stop < len(self._t) else math.inf)
             return True
+        self._budget.spend((now - float(self._t[window.start])) / search.period, window.stop - window.start)
         lock = self._choose(search, now, first, stop, self._look(search, window))
         search.failed()
         if lock is not None:
@@ -304,7 +320,7 @@ class SequenceDemodulator:
             if lock is not None:
                 locks.append(lock)
         if locks:
-            self._start(max(locks, key=lambda lock: lock.verdict.merit), first, self._known_to)
+            self._start(max(locks, key=lambda lock: lock.verdict.merit), first, float(self._t[-1]))
             self._refine_at = math.inf
 
     def _look(self, search: RateSearch, window: slice) -> Lock | None:
@@ -351,7 +367,8 @@ class SequenceDemodulator:
         if len(lock.positions) > (REFINED_AFTER - 5) * self._frame.length:
             self._refine_at = math.inf
         kept = min(self._longest, READ_BACK_CHARACTERS * self._frame.length * lock.period)
-        self._begin(lock, max(float(self._t[first]), now - kept))
+        # From an event on, as what lies before may be gone from the buffer already.
+        self._begin(lock, float(self._t[max(first, int(np.searchsorted(self._t, now - kept)))]))
 
     def _begin(self, lock: Lock, t: float) -> None:
         """Follow a lock from about the time ``t`` (ns) on."""
