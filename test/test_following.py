@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_detection import in_pieces
 
+from beacon_comm.core import motion
 from beacon_comm.core.detection import Detector
 from beacon_comm.core.events import EventBatch
 from beacon_comm.core.motion_tracks import MotionTrack
@@ -194,6 +195,7 @@ def test_the_error_is_as_large_as_the_covariance_says() -> None:
 
 def test_a_moving_light_is_ahead_of_its_events() -> None:
     track = MotionTrack(1, 10.0, 20.0, T0_NS, 4.0, 1.0, T0_NS, T0_NS, 1000.0, 0.0, latency_s=200e-6)
+    motion.begin(track.row, 0.0, 10.0, 20.0, 1000.0, 0.0, 0.01, 100.0)
     x, y = track.light_at(T0_NS)
     assert x == pytest.approx(10.2) and y == 20.0
     (xx, xy), (yx, yy) = track.covariance_at(T0_NS)

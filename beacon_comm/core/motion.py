@@ -106,6 +106,34 @@ def variance_at(row, dt_s):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def likely_variance(row, dt_s):  # type: ignore[no-untyped-def]
+    """Return the variance of position (px²), one axis, and what it grows by within ``dt_s``; of the likely modes alone.
+
+    The rarer the mode, the wider: all of them together are a safe gate, but no fair statement of the error.
+    """
+    total = x = y = vx = vy = 0.0
+    for j in range(MODES):
+        w, at = row[WEIGHT + j], _MODE + j * _SIZE
+        if w > _LIKELY:
+            total += w
+            x += w * row[at]
+            y += w * row[at + 1]
+            vx += w * row[at + 2]
+            vy += w * row[at + 3]
+    x, y, vx, vy = x / total, y / total, vx / total, vy / total
+    pp = pv = vv = noise = 0.0
+    for j in range(MODES):
+        w, at = row[WEIGHT + j] / total, _MODE + j * _SIZE
+        if w * total > _LIKELY:
+            ex, ey, evx, evy = row[at] - x, row[at + 1] - y, row[at + 2] - vx, row[at + 3] - vy
+            pp += w * (row[at + 4] + 0.5 * (ex * ex + ey * ey))
+            pv += w * (row[at + 5] + 0.5 * (ex * evx + ey * evy))
+            vv += w * (row[at + 6] + 0.5 * (evx * evx + evy * evy))
+            noise += w * ACCELERATION[j]
+    return pp, dt_s * (2.0 * pv + dt_s * (vv + noise * dt_s / 3.0))
+
+
+@njit(cache=True, nogil=True)
 def observe(row, t_s, dx, dy, variance):  # type: ignore[no-untyped-def]
     """Take an observation at ``t_s`` (s); return its squared error over the expected one, and the observation's part of that.
 

@@ -70,13 +70,16 @@ _USUAL_GAIN = 0.1
 _HIDDEN_SHARE = 0.5  # of its radius a track moves in a hop before its events are hidden from the windows
 _HIDDEN_AFTER_HOPS = 2
 _SAME_EXTENTS = 1.1  # two tracks of one blob are half a disc's centroids apart: 0.85 radii
-# What correlated errors make of the variance, calibrated on simulated scenes as the next ones are: errors to the other side
-# cancel for longer than one observation, errors that come again are partly followed.
-_CANCEL, _REPEAT = 4.2, 0.25
+# What is told of the error, calibrated on simulated scenes (docs/tracking.py, the part "errors").  Errors to the other side
+# cancel for longer than one observation; a prediction is better than the likely modes' accelerations say; a moving light's
+# edges, its turns and the readout row by row add what grows with the speed.
+_CANCEL = 4.8
+_GROWTH_SHARE = 0.35
+_AT_REST, _MOVING_PER_PX_PER_S = 0.75, 0.95e-3
 _LEAST_SHARE = 0.1
 _JUMP_PX_PER_S, _JUMP_SHARE = 300.0, 0.3  # a velocity jumps by more than so much and this share of it …
 _JUMPED_S = 0.1  # … and what was before is remembered for so long
-_GRAIN_PX = 0.02  # a spot's centroid is off by so much because its pixels differ
+_GRAIN_PX = 0.022  # a spot's centroid is off by so much because its pixels differ
 _GRAIN_SPEED_PX_PER_S = 50.0  # at this speed half of that is averaged out: a pixel in the filter's memory
 _LATENCY_SHARE = 0.25  # of the latency is its standard deviation
 
@@ -141,15 +144,16 @@ class MotionTrack(Track):
     def covariance_at(self, t_ns: int) -> Covariance:
         """Return the covariance of that (px²).
 
-        It is the filter's, corrected for errors of observations that come again (a moving light's edges) or to the other side
-        (rows are read out one after the other) and are no white noise, as the filter takes them to be; what a spot's pixels
-        differ by (in rest the same for all time, in motion averaged out); and the latency's uncertainty along the way.
+        It is the filter's likely modes', corrected for errors of observations that are no white noise, as the filter takes them
+        to be; what a spot's pixels differ by (in rest the same for all time, in motion averaged out); and the latency's
+        uncertainty along the way.
         """
         vx, vy = self.vx_px_per_s, self.vy_px_per_s
-        grain = _GRAIN_PX**2 / (1.0 + math.hypot(vx, vy) / _GRAIN_SPEED_PX_PER_S)
-        again = float(self.row[AGAIN])
-        share = max(1.0 + (_REPEAT if again > 0.0 else _CANCEL) * again, _LEAST_SHARE)
-        both = self.variance_at(t_ns) * share + grain
+        speed = math.hypot(vx, vy)
+        share = max(1.0 + _CANCEL * min(float(self.row[AGAIN]), 0.0), _LEAST_SHARE)
+        variance, growth = motion.likely_variance(self.row, max(0, t_ns - self.t_ns) / NS_PER_S)
+        both = (variance * share + _GROWTH_SHARE * growth) * (_AT_REST + _MOVING_PER_PX_PER_S * speed)
+        both += _GRAIN_PX**2 / (1.0 + speed / _GRAIN_SPEED_PX_PER_S)
         along = (_LATENCY_SHARE * self.latency_s) ** 2
         cross = along * vx * vy
         return (both + along * vx * vx, cross), (cross, both + along * vy * vy)
