@@ -374,13 +374,13 @@ def table(columns: list[str], rows: list[list[Any]]) -> str:
     return '\n'.join('| ' + ' | '.join(str(entry) for entry in line) + ' |' for line in lines) + '\n'
 
 
-def page(found: dict[str, Any], command: str) -> str:
+def page(found: dict[str, Any]) -> str:
     """Return ``docs/tracking.md``."""
-    parts = [HEAD.replace('COMMAND', command)]
+    parts, commands = [HEAD], found.get('commands', {})
     if 'speeds' in found:
         keys = dict.fromkeys(key.rsplit(' ', 1)[0] for key in found['speeds'])
         rows = [[key, *(Score(*found['speeds'][f'{key} {tracker}']).text() for tracker in TRACKERS)] for key in keys]
-        parts.append('## Characters right against image speed\n\n' + SPEEDS)
+        parts.append(f'## Characters right against image speed\n\n`{commands["speeds"]}`\n\n{SPEEDS}')
         parts.append(table(['path, px/s', *(f'`tracker: {tracker}`' for tracker in TRACKERS)], rows))
         parts.append('![Characters right against image speed](figures/tracking.png)\n')
     for name, title, text in SECTIONS:
@@ -390,7 +390,7 @@ def page(found: dict[str, Any], command: str) -> str:
         columns = list(first) if isinstance(first, dict) else ['right', 'sent', 'tracks at the end']
         values = {key: value.values() if isinstance(value, dict) else value for key, value in found[name].items()}
         rows = [[key, *(_shown(entry) for entry in entries)] for key, entries in values.items()]
-        parts.append(f'## {title}\n\n{text}')
+        parts.append(f'## {title}\n\n`{commands[name]}`\n\n{text}')
         parts.append(table(['', *columns], rows))
     return '\n'.join(parts)
 
@@ -401,8 +401,9 @@ def _shown(value: Any) -> str:
 
 HEAD = """# Tracking
 
-Written by `COMMAND` on simulated scenes ([docs/simulator.md](simulator.md)): 640 × 480, beacons of 1 kbps, default parameters
-with the bit rate listed. `motion` follows tracks by their own events ([following.py](../beacon_comm/core/following.py),
+Written by `python docs/tracking.py --write` (each part by the command below its title; all of them take an hour with `--full`)
+on simulated scenes ([docs/simulator.md](simulator.md)): 640 × 480, beacons of 1 kbps, default parameters with the rate listed.
+`motion` follows tracks by their own events ([following.py](../beacon_comm/core/following.py),
 [motion.py](../beacon_comm/core/motion.py), [motion_tracks.py](../beacon_comm/core/motion_tracks.py)) and is the default;
 `nearest` is the paper's.
 """
@@ -447,6 +448,12 @@ def draw(found: dict[str, Any], path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
+def command_of(name: str, options: argparse.Namespace) -> str:
+    """Return the command that measures a part in the same way."""
+    command = f'python docs/tracking.py --only {name}' + ' --full' * options.full
+    return command + (f' --runs {options.runs}' if name == 'crossings' and options.runs else '') + ' --write'
+
+
 def main() -> int:
     """Measure, print, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else '')
@@ -461,9 +468,10 @@ def main() -> int:
         found[name] = crossings(options.full, options.runs) if name == 'crossings' else PARTS[name](options.full)
         print(json.dumps({name: found[name]}, indent=1), flush=True)
         if options.write:
+            found.setdefault('commands', {})[name] = command_of(name, options)
             stored.write_text(json.dumps(found, indent=1) + '\n')
     if options.write:
-        (DOCS / 'tracking.md').write_text(page(found, 'python docs/tracking.py --write'))
+        (DOCS / 'tracking.md').write_text(page(found))
         if 'speeds' in found:
             draw(found, DOCS / 'figures' / 'tracking.png')
     return 0
