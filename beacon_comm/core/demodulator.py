@@ -8,9 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beacon_comm.core.character import Character
+from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.rate_bank import RateBank
 from beacon_comm.core.sequence import SequenceDemodulator
+from beacon_comm.core.sequence_detection import DELAY_FRAMES
+from beacon_comm.core.synchronisation import BITS_AFTER_DUE
 from beacon_comm.core.threshold import ThresholdDemodulator
 
 __all__ = [
@@ -20,6 +23,7 @@ __all__ = [
     'Searching',
     'SequenceDemodulator',
     'ThresholdDemodulator',
+    'decision_delay_bits',
     'make_demodulator',
 ]
 
@@ -89,3 +93,10 @@ def make_demodulator(parameters: Parameters) -> Demodulator:
     if len(parameters.bit_rates) == 1:
         return ThresholdDemodulator(parameters.bit_rates[0], parameters)
     return RateBank(parameters)
+
+
+def decision_delay_bits(parameters: Parameters) -> float:
+    """Return how many bits after a character's end the receiver has decided it, once it reads: what its documents state."""
+    if parameters.receiver == 'sequence':
+        return float(DELAY_FRAMES * CharacterFrame.from_parameters(parameters).length)
+    return BITS_AFTER_DUE

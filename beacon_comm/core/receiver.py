@@ -138,6 +138,7 @@ class Receiver:
         self._hop_ns = hop_length_ns(parameters)
         self._t_ns: int | None = None
         self._confirmed: tuple[int, ...] = ()
+        self._settled_ns: dict[int, int] = {}
 
     def push(self, batch: EventBatch) -> Output:
         """Take the next events; the paper's section III, one call a stage.
@@ -155,7 +156,7 @@ class Receiver:
                 changes = self._detection.hop(segment.t_end_ns)
                 self._lose(changes, characters, lost)
                 characters += self._slots.assign(self._detection.tracks, segment.t_end_ns, self._detection.backlog)
-                self._compare_rates()
+                self._compare_rates(segment.t_end_ns)
         return self._output(characters, lost)
 
     def flush(self) -> Output:
@@ -192,6 +193,10 @@ class Receiver:
         """Whether candidates wait because every slot is taken."""
         return self._slots.slots_full
 
+    def settled_ns(self, track_id: int) -> int | None:
+        """Return the point of the hop grid (ns) from which on a track has had its bit rate; None: it has none."""
+        return self._settled_ns.get(track_id)
+
     def beacons(self, t_ns: int | None = None) -> tuple[BeaconSnapshot, ...]:
         """Return all tracks, predicted to ``t_ns`` (ns, sensor clock; default: the stream's time)."""
         t_ns = self._t_ns if t_ns is None else t_ns
@@ -216,12 +221,14 @@ class Receiver:
         self._t_ns = batch.t_end_ns
         yield batch.slice(start, len(batch), batch.t_end_ns), False
 
-    def _compare_rates(self) -> None:
+    def _compare_rates(self, t_ns: int) -> None:
         """Tell the tracks their bit rates; take the label from one that has it of a lost one with another rate."""
+        before_ns, self._settled_ns = self._settled_ns, {}
         for track_id, track in self._detection.tracks.items():
             rate_bps = self._slots.bit_rate_bps(track_id)
             if rate_bps is None:
                 continue
+            self._settled_ns[track_id] = before_ns.get(track_id, t_ns)
             track.bit_rate_bps = rate_bps
             if track.claimed_bps is not None:
                 if abs(rate_bps / track.claimed_bps - 1.0) > _SAME_RATE:
@@ -238,6 +245,7 @@ class Receiver:
             lost.append(snapshot)
 
     def _restart(self, changes: TrackChanges) -> Output:
+        self._settled_ns = {}
         characters: list[ReceivedCharacter] = []
         lost: list[BeaconSnapshot] = []
         self._lose(changes, characters, lost)

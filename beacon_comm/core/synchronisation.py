@@ -44,6 +44,9 @@ BREAK_BITS_OVER_LENGTH = 0.5
 IDLE_BITS_OVER_LENGTH = -0.5
 """An idle line is high for so many bits more than a character has: 10.5 bits."""
 
+BITS_AFTER_DUE = 0.5
+"""Δt: the search window reaches so many bits behind where the next start edge is due; then the character is decided."""
+
 QUIET_CHARACTERS = 3
 """Without ``idle_start``: a line that is high for so many characters has no synchronisation left to keep."""
 
@@ -94,7 +97,7 @@ class EndBitSynchroniser:
             [
                 length,  # T
                 frame.stop_bits + 0.5,  # the window to the left: 5Δt, half a bit more than the stop bits
-                0.5,  # the window to the right: Δt
+                BITS_AFTER_DUE,  # the window to the right: Δt
                 length + IDLE_BITS_OVER_LENGTH if idle_start else length * QUIET_CHARACTERS,
                 length + BREAK_BITS_OVER_LENGTH,
             ]
