@@ -179,6 +179,7 @@ def test_a_beacon_is_read_confirmed_and_its_last_character_comes_out(
     assert beacon.state == beacon.CONFIRMED and beacon.bit_rate_bps == pytest.approx(BIT_RATE, rel=0.01)
 
     check_times(peer)
+    check_the_latency_is_told(peer)
     check_a_late_listener_hears_what_is_confirmed(late, track_id)
     check_garbage_is_counted(peer, node)
     check_a_track_is_lost_once(peer, track_id)
@@ -202,6 +203,16 @@ def check_times(peer: Peer) -> None:
         for message in heard:
             difference_ns = nanoseconds(message.header.stamp) - message.sensor_time_ns
             assert difference_ns == pytest.approx(OFFSET_NS, abs=1000)
+
+
+def check_the_latency_is_told(peer: Peer) -> None:
+    """The node measures how long after they were due its characters were out: of those that it did not read back."""
+    heard = [{entry.key: entry.value for entry in message.status[0].values} for message in peer.heard['/diagnostics']]
+    told = [report for report in heard if report['character_latency_characters'] != '0']
+    assert told
+    for report in told:
+        assert 0 < int(report['character_latency_characters']) <= len(characters(peer))
+        assert 0.0 <= float(report['character_latency_p50_ms']) <= float(report['character_latency_p99_ms'])
 
 
 def check_a_late_listener_hears_what_is_confirmed(late: Peer, track_id: int) -> None:

@@ -164,8 +164,12 @@ class BeaconNode(Node):
             self.log_warning('lost', f'{self._topic}: {step.lost_packets} packets lost', time.monotonic_ns())
         if step.problem is not None:
             self.log_warning(step.problem_kind, f'{self._topic}: {step.problem}', time.monotonic_ns())
+        if step.end_ns is not None:
+            self.report.latency.arrived(step.end_ns, arrival_ns)
         self._publish(step)
-        lag_ns = time.time_ns() - arrival_ns
+        published_ns = time.time_ns()
+        self.report.latency.published(step.due_ns, published_ns)
+        lag_ns = published_ns - arrival_ns
         self._shedder.read(lag_ns - waited_ns)
         self.report.published(lag_ns / NS_PER_S)
 

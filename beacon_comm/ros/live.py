@@ -15,8 +15,10 @@ from collections import Counter
 from dataclasses import dataclass
 
 from beacon_comm.core.bearing import CameraModel
+from beacon_comm.core.demodulator import decision_delay_bits
 from beacon_comm.core.errors import CalibrationError
-from beacon_comm.core.events import EventBatch
+from beacon_comm.core.events import NS_PER_S, EventBatch
+from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.receiver import BeaconSnapshot, Output, Receiver
 from beacon_comm.ros.clock_map import ClockMap
@@ -37,6 +39,9 @@ class Step:
         problem: why the message was not read, None if it was.
         problem_kind: the kind it was counted under, '' if none.
         lost_packets: messages missing before this one.
+        end_ns: the stream's time after the message (ns), None if it gave no events.
+        due_ns: times of the stream (ns) at which those of the characters were due that fell due while they were being read:
+            their ends and the receiver's decision delay.
     """
 
     at: Instant
@@ -46,6 +51,8 @@ class Step:
     problem: str | None = None
     problem_kind: str = ''
     lost_packets: int = 0
+    end_ns: int | None = None
+    due_ns: tuple[int, ...] = ()
 
 
 class LiveReceiver:
@@ -68,6 +75,9 @@ class LiveReceiver:
         self._time = StreamTime(silent_after_ns, lag_ns)
         self._clock_map = ClockMap()
         self._gathered: list[StampedCharacter] = []
+        self._due_ns: list[int] = []
+        frame = CharacterFrame.from_parameters(parameters)
+        self._bits_to_due = frame.length + decision_delay_bits(parameters)
         self._lost: list[BeaconSnapshot] = []
         self._confirmed_changed = False
         self.camera_problem = ''
@@ -163,6 +173,10 @@ class LiveReceiver:
         """Return all tracks at the stream's time."""
         return () if self._receiver is None else self._receiver.beacons()
 
+    def settled_ns(self, track_id: int) -> int | None:
+        """Return since when a track has been read without interruption (ns, stream), None if it is not."""
+        return None if self._receiver is None else self._receiver.settled_ns(track_id)
+
     def now(self, now_ns: int) -> Instant:
         """Return the stream's time; ROS time is the node's clock before the first event."""
         stream_ns = None if self._receiver is None else self._receiver.t_ns
@@ -221,14 +235,20 @@ class LiveReceiver:
         for received in output.characters:
             character = received.character
             self._gathered.append(StampedCharacter(received.track_id, character, self.instant(character.t_ns)))
+            due_ns = character.t_ns + round(self._bits_to_due * NS_PER_S / character.bit_rate_bps)
+            settled_ns = self.settled_ns(received.track_id)
+            if settled_ns is not None and due_ns > settled_ns:
+                self._due_ns.append(due_ns)
         self._lost += output.lost
         self._confirmed_changed |= output.confirmed_changed
 
     def _step(self, now_ns: int, decoded: Decoded | None = None) -> Step:
         characters, lost, changed = tuple(self._gathered), tuple(self._lost), self._confirmed_changed
-        self._gathered, self._lost, self._confirmed_changed = [], [], False
+        due_ns = tuple(self._due_ns)
+        self._gathered, self._lost, self._confirmed_changed, self._due_ns = [], [], False, []
         now = self.now(now_ns)
         if decoded is None:
             return Step(now, characters, lost, changed)
         kind = decoded.problem_kind or ''
-        return Step(now, characters, lost, changed, decoded.problem, kind, decoded.lost_packets)
+        end_ns = None if decoded.batch is None or self._receiver is None else self._receiver.t_ns
+        return Step(now, characters, lost, changed, decoded.problem, kind, decoded.lost_packets, end_ns, due_ns)

@@ -6,6 +6,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from beacon_comm.core.events import NS_PER_S
+from beacon_comm.ros.latency import CharacterLatency
 from beacon_comm.ros.live import LiveReceiver, Step
 
 
@@ -47,6 +48,7 @@ class Report:
     def __init__(self) -> None:
         self.traffic = Traffic()
         self.totals: Counter[str] = Counter()
+        self.latency = CharacterLatency()
         self._events = 0
         self._looked_ns: int | None = None
 
@@ -87,6 +89,7 @@ class Report:
             'characters_per_s': f'{traffic.characters / seconds:.1f}' if seconds > 0.0 else 'nan',
             'queue_lag_s': f'{traffic.longest_wait_s:.4f}',
             'lag_s': f'{traffic.longest_lag_s:.4f}',
+            **self.latency.look(),
             'tracks': len(tracks),
             **{f'tracks_{state}': count for state, count in sorted(states.items())},
             'slots_full': live.slots_full,
