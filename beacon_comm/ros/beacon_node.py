@@ -40,7 +40,15 @@ from beacon_comm.ros.report import Report
 from beacon_comm.ros.silence import Cause, Silence, Situation, why_silent
 from beacon_comm.ros.text import Texts
 from beacon_comm.ros.throttled_log import ThrottledLog
-from beacon_comm.ros.topic import Publishers, choose_type, find_publishers, is_supported, similar_topics, subscribe_raw
+from beacon_comm.ros.topic import (
+    Publishers,
+    choose_type,
+    find_publishers,
+    is_supported,
+    message_class,
+    similar_topics,
+    subscribe_raw,
+)
 
 NODE_NAME = 'beacon_node'
 GRAPH_PERIOD_S = 0.25
@@ -237,14 +245,17 @@ class BeaconNode(Node):
     def _subscribe(self, message_type: str) -> None:
         events = SubscriptionEventCallbacks(matched=self._on_matched, message_lost=self._on_message_lost)
         try:
-            subscription = subscribe_raw(self, message_type, self._topic, self._on_message, self._qos, events)
+            message_class(message_type)
         except ImportError as error:
             self._not_installed = message_type
             self.get_logger().error(f'{self._topic} carries {message_type}, which is not installed here: {error}')
             return
         if self._subscription is not None:
+            # Before the other one comes: the middleware refuses two types of one topic in one process.
             self.destroy_subscription(self._subscription)
-        self._subscription, self._type, self._not_installed = subscription, message_type, ''
+            self._subscription, self._type = None, None
+        self._subscription = subscribe_raw(self, message_type, self._topic, self._on_message, self._qos, events)
+        self._type, self._not_installed = message_type, ''
         self._open_stream()
         self.get_logger().info(f'reading {self._topic} ({message_type})')
 
