@@ -48,11 +48,14 @@ from beacon_comm.ros.topic import (
     message_class,
     similar_topics,
     subscribe_raw,
+    take_waiting,
 )
 
 NODE_NAME = 'beacon_node'
 GRAPH_PERIOD_S = 0.25
 REPORT_PERIOD_S = 1.0
+LONGEST_TURN_S = 0.01
+"""Messages are read for so long before the timers have their turn."""
 LOG_PERIOD_NS = NS_PER_S
 SILENCE_LOG_PERIOD_NS = 10 * NS_PER_S
 ACKNOWLEDGED_WITHIN = Duration(nanoseconds=NS_PER_S // 5)
@@ -157,8 +160,18 @@ class BeaconNode(Node):
 
     # --- inputs ---
 
-    @guarded
     def _on_message(self, cdr: bytes, info: dict[str, int]) -> None:
+        # A turn of the executor takes as long as reading a packet: messages that wait are read in the same one.
+        stop_s = time.monotonic() + LONGEST_TURN_S
+        self._read(cdr, info)
+        while time.monotonic() < stop_s and (waiting := self._next_waiting()) is not None:
+            self._read(*waiting)
+
+    def _next_waiting(self) -> tuple[bytes, dict[str, int]] | None:
+        return None if self._subscription is None else take_waiting(self._subscription)
+
+    @guarded
+    def _read(self, cdr: bytes, info: dict[str, int]) -> None:
         # A middleware that does not stamp arrivals gives 0: then nothing is known to have waited.
         arrival_ns = info['received_timestamp'] or time.time_ns()
         waited_ns = time.time_ns() - arrival_ns

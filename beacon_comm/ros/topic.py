@@ -76,6 +76,13 @@ def subscribe_raw(
         return node.create_subscription(cls, topic, callback, qos, raw=True)
 
 
+def take_waiting(subscription: Subscription) -> tuple[bytes, dict[str, int]] | None:
+    """Return the message that waits longest in a raw subscription's queue, and its information; None if none waits."""
+    with subscription.handle:
+        taken: tuple[bytes, dict[str, int]] | None = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+    return taken
+
+
 def find_publishers(node: Node, topic: str, qos: QoSProfile) -> Publishers:
     """Look at the graph: the publishers of a resolved topic name, against the QoS we ask for."""
     infos = node.get_publishers_info_by_topic(topic)
