@@ -22,6 +22,18 @@ MESSAGES := $(wildcard msg/*.msg)
 BUILD_FILES := CMakeLists.txt setup.py setup.cfg pyproject.toml package.xml $(wildcard cmake/*)
 INTERFACE := interfaces/event_camera_msgs
 INTERFACE_FILES := $(INTERFACE)/package.xml $(INTERFACE)/CMakeLists.txt $(wildcard $(INTERFACE)/msg/*.msg)
+BENCH_INTERFACE := interfaces/dvs_msgs
+BENCH_INTERFACE_FILES := $(BENCH_INTERFACE)/package.xml $(BENCH_INTERFACE)/CMakeLists.txt $(wildcard $(BENCH_INTERFACE)/msg/*.msg)
+
+# Build a message package (1: its folder) and install it (2: where).
+define build_interface
+export AMENT_PREFIX_PATH=$(abspath $(VENV)) && \
+( cmake -S $(1) -B $(VENV)/build/$(notdir $(1)) -G Ninja -DCMAKE_BUILD_TYPE=Release \
+    -DBUILD_TESTING=OFF -DCMAKE_INSTALL_PREFIX=$(abspath $(2)) -DCMAKE_PREFIX_PATH=$(abspath $(VENV)) \
+    -DPython3_EXECUTABLE=$(abspath $(BIN))/python -DCMAKE_PROJECT_INCLUDE=$(ROOT)/cmake/ros_wheels.cmake && \
+  cmake --build $(VENV)/build/$(notdir $(1)) && cmake --install $(VENV)/build/$(notdir $(1)) \
+) > $(VENV)/$(notdir $(1)).log 2>&1 || { cat $(VENV)/$(notdir $(1)).log >&2; exit 1; }
+endef
 
 .PHONY: help setup demo test bench lint clean
 .DELETE_ON_ERROR:
@@ -30,7 +42,7 @@ help:
 	@echo 'make setup   make .venv: Python, ROS 2 from PyPI, this package with its messages, test tools'
 	@echo 'make demo    setup, then replay a short recording into the live node and print what it reads'
 	@echo 'make test    setup, then lint and all tests'
-	@echo 'make bench   setup, then measure the speed on one core: a table, and bench.json'
+	@echo 'make bench   setup, then measure the speed, by stages and live: tables, and bench.json'
 	@echo 'make lint    setup, then ruff and mypy'
 	@echo 'make clean   remove .venv and everything built'
 
@@ -48,9 +60,15 @@ test: lint
 	@$(BIN)/pytest test
 
 # PyPI's evt3 is only compared with; the bench says so where it is missing.
-bench: setup
+bench: setup $(STAMPS)/dvs_msgs
 	@$(BIN)/python -c 'import evt3' 2>/dev/null || $(BIN)/python -m pip install --quiet evt3 || true
 	@$(BIN)/python bench/bench.py
+
+# The bench's second message type; in a folder of its own, since the environment is to be as a robot's without it.
+$(STAMPS)/dvs_msgs: $(BENCH_INTERFACE_FILES) cmake/ros_wheels.cmake | $(STAMPS)/requirements
+	@echo 'bench: building dvs_msgs from $(BENCH_INTERFACE)'
+	@$(call build_interface,$(BENCH_INTERFACE),$(VENV)/bench)
+	@touch $@
 
 clean:
 	rm -rf $(VENV) build install log *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
@@ -79,12 +97,6 @@ $(STAMPS)/package: $(BUILD_FILES) $(MESSAGES) msg | $(STAMPS)/requirements
 # event_camera_msgs is on apt only, so the message is built from our definition of it, once it is missing.
 $(STAMPS)/event_camera_msgs: $(INTERFACE_FILES) cmake/ros_wheels.cmake | $(STAMPS)/requirements
 	@if [ -e $@ ] || ! $(BIN)/python -c 'import event_camera_msgs' 2>/dev/null; then \
-	  echo 'setup: building event_camera_msgs from $(INTERFACE)' && \
-	  export AMENT_PREFIX_PATH=$(abspath $(VENV)) && \
-	  ( cmake -S $(INTERFACE) -B $(VENV)/build/event_camera_msgs -G Ninja -DCMAKE_BUILD_TYPE=Release \
-	      -DBUILD_TESTING=OFF -DCMAKE_INSTALL_PREFIX=$(abspath $(VENV)) -DCMAKE_PREFIX_PATH=$(abspath $(VENV)) \
-	      -DPython3_EXECUTABLE=$(abspath $(BIN))/python -DCMAKE_PROJECT_INCLUDE=$(ROOT)/cmake/ros_wheels.cmake && \
-	    cmake --build $(VENV)/build/event_camera_msgs && cmake --install $(VENV)/build/event_camera_msgs \
-	  ) > $(VENV)/event_camera_msgs.log 2>&1 || { cat $(VENV)/event_camera_msgs.log >&2; exit 1; }; \
+	  echo 'setup: building event_camera_msgs from $(INTERFACE)' && $(call build_interface,$(INTERFACE),$(VENV)); \
 	fi
 	@touch $@

@@ -4,8 +4,8 @@
     make bench                                                  # under ten minutes
     python bench/bench.py [--only decoding chain …] [--json bench.json] [--figure docs/figures/speed.png]
 
-One core; all times are processor time of this process, the best of several runs.  ``bench.json`` is one flat object:
-each key ends with its unit.  What is measured live, through DDS, is a section of its own: add it to ``SECTIONS``.
+One core; all times are processor time of this process, the best of several runs; but for ``live``, which is the node's
+own process through DDS, by the clock (:mod:`live`).  ``bench.json`` is one flat object: each key ends with its unit.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))  # PYTHONSAFEPATH leaves it out
 
+from live import Phase, can_publish_arrays, measure  # noqa: E402
 from measuring import ChainRun, MetricTable, best_s, mev_per_s, module_ns, run_chain  # noqa: E402
 from streams import Stream, make_stream, messages, real_words  # noqa: E402
 
@@ -254,6 +255,61 @@ def scaling(folder: Path) -> MetricTable:
     return metrics
 
 
+LIVE_RATES, LIVE_ARRAY_RATES, LATENCY_RATE = (2.5, 5.0, 10.0, 20.0, 40.0), (5.0, 10.0, 20.0), 10.0
+
+
+def live(folder: Path) -> MetricTable:
+    """Measure the node through DDS: the highest rates that it holds, and the latency of its characters."""
+    load = os.getloadavg()[0]
+    if not can_publish_arrays():
+        print('dvs_msgs is not installed (make bench builds it): EventArray is not measured', file=sys.stderr)
+    phases = measure(folder, LIVE_RATES, LIVE_ARRAY_RATES if can_publish_arrays() else ())
+    head(
+        f'Live, through DDS: 1280 x 720, packets of 1 ms, two beacons; {os.cpu_count()} processors, load {load:.1f} before',
+        'messages', 'asked for, Mev/s', 'offered, Mev/s', 'publisher late by, ms', 'read, Mev/s', 'lost', 'shed', 'lag, ms',
+        'character latency p50, ms', 'p99, ms', 'characters', 'confirmed', 'node, cores', 'publisher, cores',
+    )  # fmt: skip
+    for phase in phases:
+        print_phase(phase)
+    return live_metrics(phases)
+
+
+def print_phase(phase: Phase) -> None:
+    """Print a phase's line."""
+    shed = f'{phase.shed / max(phase.measured, 1):.2%}' if phase.shed else '0'
+    p50, p99 = ('–' if ms is None else ms for ms in (phase.latency_p50_ms, phase.latency_p99_ms))
+    row(
+        'EventPacket' if phase.encoding == 'evt3' else 'EventArray', phase.scene_mev_per_s, phase.offered_mev_per_s,
+        phase.late_ms, phase.events_mev_per_s, phase.missing, shed, phase.lag_ms, p50, p99, phase.latency_characters,
+        phase.confirmed, phase.node_cores, phase.publisher_cores,
+    )  # fmt: skip
+
+
+def live_metrics(phases: Sequence[Phase]) -> MetricTable:
+    """Return the metrics of the live phases; a rate counts as far as it was really offered."""
+    metrics: MetricTable = {}
+    for encoding, name in (('evt3', 'packet'), ('event_array', 'event_array')):
+        ours = [phase for phase in phases if phase.encoding == encoding]
+        if not ours:
+            continue
+        best = max((phase for phase in ours if phase.held), key=lambda phase: phase.offered_mev_per_s, default=None)
+        metrics[f'live_{name}_mev_per_s'] = 0.0 if best is None else best.offered_mev_per_s
+        if best is not None and best.latency_p99_ms is not None:
+            metrics[f'live_{name}_character_latency_at_that_rate_p99_ms'] = best.latency_p99_ms
+        for phase in ours:
+            key = f'live_{name}_{phase.nominal_mev_per_s:g}mev'
+            metrics[f'{key}_offered_mev_per_s'] = phase.offered_mev_per_s
+            metrics[f'{key}_shed_percent'] = 100.0 * phase.shed / max(phase.measured, 1)
+            metrics[f'{key}_lost_packets'] = phase.missing
+            if phase.latency_p50_ms is not None and phase.latency_p99_ms is not None:
+                metrics[f'{key}_character_latency_p50_ms'] = phase.latency_p50_ms
+                metrics[f'{key}_character_latency_p99_ms'] = phase.latency_p99_ms
+    at_10 = next((p for p in phases if p.encoding == 'evt3' and p.nominal_mev_per_s == LATENCY_RATE), None)
+    if at_10 is not None and at_10.latency_p99_ms is not None:
+        metrics['character_latency_p99_ms'] = at_10.latency_p99_ms
+    return metrics
+
+
 def draw(metrics: MetricTable, path: Path) -> None:
     """Draw the cost of a hop by rate, and of a beacon by beacons."""
     import matplotlib
@@ -293,6 +349,7 @@ SECTIONS: dict[str, Callable[[Path], MetricTable]] = {
     'stages': stages,
     'hops': hops,
     'scaling': scaling,
+    'live': live,
 }
 
 
@@ -310,7 +367,7 @@ def main() -> None:
     begun = time.perf_counter()
     for receiver in ('threshold', 'sequence'):
         warm_up(Parameters(receiver=receiver))
-    print(f'# Speed on one core\n\n{platform.machine()}, Python {platform.python_version()}, numba {numba.__version__}')
+    print(f'# Speed\n\n{platform.machine()}, Python {platform.python_version()}, numba {numba.__version__}')
     metrics: MetricTable = {}
     for name in arguments.only:
         metrics |= SECTIONS[name](Path(arguments.folder))

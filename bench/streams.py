@@ -30,6 +30,11 @@ from beacon_comm.wire.stream import EventStream
 BAG, BAG_SIZE = 'libcaer_grid', (346, 260)
 WORDS_BAG = 'evt3_static'
 RECORDINGS = (('3125hz_30m.mat', 1.0), ('504hz_30m.mat', 12.2))  # and where their text is under way (s)
+LOOP_NS = 1_024_000_000
+"""Length of a stream that can be repeated: whole packets, and whole steps of evt3's upper time bits (4096 µs)."""
+LOOP_CHARACTERS = ((291, 3123.8), (47, 503.9))
+"""Of each recording so many characters, at its bit rate (bit/s), fill a loop, stretched by less than 0.3 %."""
+BITS = 11
 START_NS = NS_PER_S
 RADIUS_PX = 4.0
 
@@ -111,7 +116,26 @@ def looped(t_ns: NDArray[np.int64], polarity: NDArray[np.int8], start_s: float, 
     return EventBatch(pixel, pixel, np.tile(polarity, count)[:n], t_all[:n], duration_ns)
 
 
-def beacons(folder: Path, size: tuple[int, int], count: int, duration_ns: int) -> list[EventBatch]:
+def seamless(t_ns: NDArray[np.int64], polarity: NDArray[np.int8], start_s: float, characters: int, rate: float) -> EventBatch:
+    """Return whole characters of a recording from ``start_s`` on, which can be sent round and round; pixels are all 0.
+
+    Args:
+        t_ns, polarity: the recording (ns, ±1).
+        start_s: where to begin (s).
+        characters: how many.
+        rate: their bit rate (bit/s).
+    """
+    begin_ns = t_ns[0] + round(start_s * NS_PER_S)
+    length_ns = characters * BITS / rate * NS_PER_S
+    first, stop = np.searchsorted(t_ns, [begin_ns, begin_ns + length_ns])
+    looped_ns = ((t_ns[first:stop] - begin_ns) * (LOOP_NS / length_ns)).astype(np.int64)
+    pixel = np.zeros(stop - first, np.uint16)
+    return EventBatch(pixel, pixel, polarity[first:stop], np.minimum(looped_ns, LOOP_NS - 1), LOOP_NS)
+
+
+def beacons(
+    folder: Path, size: tuple[int, int], count: int, duration_ns: int, repeatable: bool = False
+) -> list[EventBatch]:
     """Return ``count`` beacons on a grid, the two recordings by turns, each begun elsewhere in its text."""
     across = int(np.ceil(np.sqrt(count * size[0] / size[1])))
     down = -(-count // across)
@@ -119,7 +143,11 @@ def beacons(folder: Path, size: tuple[int, int], count: int, duration_ns: int) -
     placed = []
     for k in range(count):
         t_ns, polarity, start_s = recordings[k % len(recordings)]
-        events = looped(t_ns, polarity, start_s + 0.02 * (k // len(recordings)), duration_ns)
+        start_s += 0.02 * (k // len(recordings))
+        if repeatable:
+            events = seamless(t_ns, polarity, start_s, *LOOP_CHARACTERS[k % len(recordings)])
+        else:
+            events = looped(t_ns, polarity, start_s, duration_ns)
         x = size[0] * (k % across + 0.5) / across
         y = size[1] * (k // across + 0.5) / down
         xs, ys = Disc(x, y, RADIUS_PX, 0.0, 0.0, *size).pixels(events.t_ns, [1, k])
@@ -134,6 +162,7 @@ def make_stream(
     duration_s: float,
     beacon_count: int = 2,
     packet_ns: int = 1_000_000,
+    repeatable: bool = False,
 ) -> Stream:
     """Return a background with beacons in it, cut into packets.
 
@@ -144,9 +173,10 @@ def make_stream(
         duration_s: length of the stream (s).
         beacon_count: how many.
         packet_ns: length of a packet (ns).
+        repeatable: it can be sent round and round without a break in what the beacons say; only of :data:`LOOP_NS`.
     """
     duration_ns = round(duration_s * NS_PER_S)
-    parts = beacons(folder, size, beacon_count, duration_ns)
+    parts = beacons(folder, size, beacon_count, duration_ns, repeatable)
     if events_per_s:
         parts.insert(0, tiled(bag_events(folder / BAG), size, events_per_s, duration_ns))
     t_ns = np.concatenate([part.t_ns for part in parts]) // 1000 * 1000 + START_NS
