@@ -63,5 +63,5 @@ def test_many_candidates_spend_no_more_than_one(tracks: int, monkeypatch: pytest
     parameters, seconds = Parameters(search_load=0.05), 3.0
     spent = clutter(parameters, monkeypatch, tracks, seconds)
     turns = 2  # each begins with a full bucket, and may go into debt by a look or two
-    assert 0.05 < spent < 0.05 * (seconds + turns * BURST_S) + 2 * turns * tracks * 0.025
+    assert 0.05 < spent < 0.05 * (seconds + turns * BURST_S) + 2 * 2 * turns * tracks * 0.025
     assert clutter(Parameters(search_load=100.0), monkeypatch, tracks, seconds) > 2.0 * spent

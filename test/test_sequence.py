@@ -13,6 +13,7 @@ from beacon_comm.core.character import Status
 from beacon_comm.core.demodulator import make_demodulator
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.parameters import Parameters
+from beacon_comm.core.rate_search import ListedSearch
 from beacon_comm.core.sequence import SequenceDemodulator
 from beacon_comm.evaluation.held import Signal
 from beacon_comm.evaluation.scoring import score
@@ -442,6 +443,24 @@ def test_where_little_is_spent_on_searching_a_beacon_is_found_later():
                 found_ns = cut_ns
         known.append(found_ns)
     assert None not in known and known[0] > known[1]
+
+
+def test_what_was_buffered_is_searched_with_what_the_bucket_holds():
+    """And read all the same, when the search has gone on with what came after."""
+    t_ns, polarity = beacon_events(text_bits(PROSE * 3), 1250.0)
+    half = len(t_ns) // 2
+    receiver = demodulator(search='blind', search_load=0.02)
+    receiver.share(0.02, int(t_ns[half]))
+    assert receiver.push(t_ns[:half], polarity[:half], int(t_ns[half])) == [] and receiver.bit_rate_bps is None
+    assert text_of(decode(receiver, t_ns[half:], polarity[half:], tail_ns=3 * NS)) == PROSE * 3
+
+
+@pytest.mark.parametrize('gap_ns', [5_000_000, 60_000_000])
+def test_behind_a_long_gap_the_search_waits_for_enough_to_look_at(gap_ns):
+    search = ListedSearch(504.0, CharacterFrame())
+    before = search.due
+    search.miss(50_000_000.0, 50_000_000.0 + gap_ns)
+    assert search.due == (before if gap_ns < 20_000_000 else pytest.approx(before + 50_000_000 + gap_ns))
 
 
 def test_what_was_searched_before_is_read_when_a_beacon_is_found():

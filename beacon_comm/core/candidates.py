@@ -194,7 +194,7 @@ class CandidateSlots:
         queue = self._queue(tracks)
         self._end_turns_that_are_over(t_ns, len(queue) - self._free)
         given = queue[: self._free]
-        self._share_search_load(len(given))
+        self._share_search_load(len(given), t_ns)
         self._slots_full = len(queue) > len(given)
         received = []
         for track_id in given:
@@ -312,7 +312,7 @@ class CandidateSlots:
         slot = self._slots.pop(track_id)
         self._tried[track_id] = _Tried(t_ns, slot.record, slot.read_to_ns)
 
-    def _share_search_load(self, more: int) -> None:
+    def _share_search_load(self, more: int, t_ns: int) -> None:
         """Share what may be spent on searching among the slots without a bit rate, and so many more that are given now."""
         searching = [
             slot.demodulator
@@ -321,7 +321,7 @@ class CandidateSlots:
         ]
         self._search_share = self._p.search_load / max(1, len(searching) + more)
         for demodulator in searching:
-            demodulator.share(self._search_share)
+            demodulator.share(self._search_share, t_ns)
 
     def _give(self, track_id: int, t_ns: int, times: Times, polarity: Polarities) -> list[ReceivedCharacter]:
         tried = self._tried.pop(track_id, None)
@@ -331,7 +331,7 @@ class CandidateSlots:
         self._slots[track_id] = slot
         slot.record.advance(t_ns, quiet=False)
         if isinstance(slot.demodulator, Searching):
-            slot.demodulator.share(self._search_share)
+            slot.demodulator.share(self._search_share, t_ns)
             if tried is not None:
                 slot.demodulator.searched(tried.ended_ns)
         received = []

@@ -77,8 +77,8 @@ class GapAware(Protocol):
 class Searching(Protocol):
     """A demodulator that looks for the bit rate again and again, at a cost."""
 
-    def share(self, load: float) -> None:
-        """Spend from now on no more computing time per event time on it; 1: one core."""
+    def share(self, load: float, t_ns: int) -> None:
+        """Spend from ``t_ns`` (ns) on no more computing time per event time on it (1: one core)."""
         ...
 
     def searched(self, to_ns: int) -> None:

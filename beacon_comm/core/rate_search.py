@@ -149,8 +149,13 @@ class RateSearch:
         raise NotImplementedError
 
     def postpone(self, t: float) -> None:
-        """Make the next attempt at ``t`` (ns)."""
+        """Make the next attempt at ``t`` (ns), if it was to be earlier."""
         self._at = max(self._at, (t - self._since) / self._character)
+
+    def miss(self, start: float, stop: float) -> None:
+        """Hear of missing events (ns): behind a gap longer than a character there must be enough again to look at."""
+        if stop - start > self._character:
+            self.postpone(stop + self._attempts[0] * self._character)
 
     def failed(self) -> None:
         """Go on to the next attempt."""

@@ -1,18 +1,20 @@
 """A budget of computing for the search of bit rates, counted in event time.
 
 To look for a bit rate costs a thousand times what it costs to follow one.  Where a scene is full of blobs that are no beacons,
-all slots look for rates all the time, and the node would fall behind.  So each demodulator has a bucket of computing time::
+all slots look for rates all the time, and the node would fall behind.  So each demodulator has a bucket of computing time for
+the listed rates and one for the blind search::
 
     level   ▔▔╲        ╱▔▔╲    ╱▔╲      a look costs what its window holds; below zero the next looks wait until
-       0 ─────╲───╱─────╲─╱───╱──       the level is back: it rises by the demodulator's share of the load
+       0 ─────╲───╱─────╲─╱───╱──       the level is back: it rises by the bucket's share of the load
                ╲╱        ╲╱             with the time of the *events*
 
+What was buffered before the demodulator began is read at once, and for it there is what the bucket holds, and no more.
 Costs are nominal, from the window's bits and events, and nothing is measured, so that any batching gives the same.
 """
 
 from __future__ import annotations
 
-BURST_S = 1.0
+BURST_S = 0.3
 """A full bucket holds the share of so much event time (s)."""
 
 BIT_COST_S, EVENT_COST_S = 25e-6, 30e-9
@@ -20,7 +22,7 @@ BIT_COST_S, EVENT_COST_S = 25e-6, 30e-9
 
 
 class SearchBudget:
-    """The bucket of one demodulator; times are in ns from any origin.
+    """A bucket; times are in ns from any origin.
 
     Args:
         load: computing time per event time, 1: one core.

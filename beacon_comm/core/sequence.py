@@ -100,7 +100,9 @@ class SequenceDemodulator:
         self._usable_from = -math.inf  # events before this are not read again
         self._found_at = -math.inf  # when the lock was found
         self._searched_to_ns: int | None = None  # by the demodulator before this one
-        self._budget = SearchBudget(parameters.search_load)
+        kinds = {type(search) for search in self._searches}
+        self._budgets = {kind: SearchBudget(parameters.search_load / len(kinds)) for kind in kinds}
+        self._shared: tuple[float, int] | None = None  # load, from when on (ns), before the first event
 
     @property
     def _t(self) -> NDArray[np.float64]:
@@ -137,6 +139,8 @@ class SequenceDemodulator:
             if not len(t_ns):
                 return []
             self._origin_ns = int(t_ns[0])
+            if self._shared is not None:
+                self.share(*self._shared)
             self._restart(0.0 if self._searched_to_ns is None else max(0.0, float(self._searched_to_ns - self._origin_ns)))
         self._ended = None
         self._events.append(t_ns - self._origin_ns, polarity)
@@ -160,9 +164,13 @@ class SequenceDemodulator:
         self._known_to = t_end
         return characters
 
-    def share(self, load: float) -> None:
+    def share(self, load: float, t_ns: int) -> None:
         """Spend no more on searching; see :class:`beacon_comm.core.demodulator.Searching`."""
-        self._budget.set_load(load, max(self._known_to, 0.0))
+        if self._origin_ns is None:
+            self._shared = load, t_ns
+            return
+        for budget in self._budgets.values():
+            budget.set_load(load / len(self._budgets), float(t_ns - self._origin_ns))
 
     def searched(self, to_ns: int) -> None:
         """Hear of searched events; see :class:`beacon_comm.core.demodulator.Searching`."""
@@ -173,6 +181,8 @@ class SequenceDemodulator:
         if self._origin_ns is not None:
             gap = np.array([[start_ns - self._origin_ns, stop_ns - self._origin_ns]], np.float64)
             self._gaps = np.concatenate((self._gaps, gap))
+            for search in self._searches:
+                search.miss(*gap[0].tolist())
 
     def flush(self) -> list[Character]:
         """End the stream; see :class:`beacon_comm.core.demodulator.Demodulator`."""
@@ -293,7 +303,8 @@ class SequenceDemodulator:
         now = search.due
         if not now <= t_end:
             return False
-        ready = self._budget.ready_at(now)
+        budget = self._budgets[type(search)]
+        ready = budget.ready_at(now)
         if ready > now + 1.0:  # ns, beyond rounding
             search.postpone(ready)
             return True
@@ -303,7 +314,7 @@ class SequenceDemodulator:
         if window is None:  # nothing there: wait for the next event
             search.restart(float(self._t[stop]) if stop < len(self._t) else math.inf)
             return True
-        self._budget.spend((now - float(self._t[window.start])) / search.period, window.stop - window.start)
+        budget.spend((now - float(self._t[window.start])) / search.period, window.stop - window.start)
         lock = self._choose(search, now, first, stop, self._look(search, window))
         search.failed()
         if lock is not None:
