@@ -17,8 +17,8 @@ from beacon_comm.core.rate_search import ListedSearch
 from beacon_comm.core.sequence import SequenceDemodulator
 from beacon_comm.evaluation.held import Signal
 from beacon_comm.evaluation.scoring import score
-from beacon_comm.simulation.led import noise, square_wave
-from beacon_comm.simulation.stress import with_clock, with_drifting_clock
+from beacon_comm.simulation.led import noise, simulate_text, square_wave
+from beacon_comm.simulation.stress import with_clock, with_drifting_clock, with_fading
 
 PROSE = "Shall I compare thee to a summer's day?\nThou art more lovely and more temperate:\n"
 OTHER = "Rough winds do shake the darling buds of May,\nAnd summer's lease hath all too short a date:\n"
@@ -346,6 +346,13 @@ def test_a_gap_it_is_told_of_costs_what_it_overlaps_and_two_more(gap_bits, begin
     assert [k for k, c in found if c.status is Status.OK and c.code != ord(sent[k])] == []
     right = {k for k, c in found if c.code == ord(sent[k])}
     assert set(range(len(sent))) - right <= set(range(begin // 11_000_000, end // 11_000_000 + 3))
+
+
+def test_held_bits_of_a_signal_that_fades_are_no_gap():
+    """At a tenth of the amplitude many held bits have no event: five zeros of a space are still a space."""
+    t_ns, polarity = simulate_text(PROSE * 5, 1000.0, t0_ns=NS, frame=CharacterFrame(), seed=3)
+    seen = with_fading(t_ns, polarity, 10.0, seed=5)
+    assert text_of(decode(demodulator(1000.0), *seen)) == PROSE * 5
 
 
 @pytest.mark.parametrize('off_bits', [0.1, 0.3, 0.5, 0.7, 0.9])

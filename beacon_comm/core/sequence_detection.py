@@ -461,7 +461,9 @@ def _in_gap(state, bit):  # type: ignore[no-untyped-def]
         first -= 1
     while totals[last & _RING_MASK] == 0.0 and last < newest:
         last += 1
-    share = min(max(state.levels[EMPTY], LEAST_EMPTY), MOST_EMPTY)
+    # Where a signal has faded, more held bits are empty than were learnt to be.
+    faded = np.exp(-min(state.means[0], state.means[CONTEXTS - 1]) * state.levels[GAIN])
+    share = min(max(state.levels[EMPTY], faded, LEAST_EMPTY), MOST_EMPTY)
     return (last - first - 1) * -np.log(share) > EMPTY_EVIDENCE
 
 
