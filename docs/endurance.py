@@ -10,13 +10,14 @@
     all the time  noise;  1 % of the packets is lost
     packets       10 ms of evt3 words, through the live receiver: reader, clocks, detection, demodulators
 
-Held to: a label is never given twice, what is confirmed lies where a beacon was at that time, memory does not grow, and
-hardly a character that is OK is not what was sent.
+Held to: a label is given again only near where it was lost and within `reacquire_s`, what is confirmed lies where a beacon was
+at that time, memory does not grow, and hardly a character that is OK is not what was sent.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 import time
@@ -33,6 +34,7 @@ from beacon_comm.core.character import Status
 from beacon_comm.core.events import NS_PER_S, EventBatch
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.parameters import Parameters
+from beacon_comm.core.receiver import BeaconSnapshot
 from beacon_comm.recordings.disc import Disc
 from beacon_comm.ros.live import LiveReceiver, Step
 from beacon_comm.simulation.led import OUTDOOR_30_M, sensor_noise, simulate_text, square_wave
@@ -91,15 +93,18 @@ class Tally:
 
     Attributes:
         counts: of beacons, characters, confirmations.
-        labels: labels that were seen, of tracks that are there and that are gone.
+        labels: labels that were seen.
+        gone: of lost tracks, and when (ns) and where (px) they were last seen.
+        read: beacons of which a confirmed track gave a right character, by when they began (ns).
         problems: broken promises, as text.
         sizes_mib: memory that the process held, minute by minute.
     """
 
     counts: Counter[str] = field(default_factory=Counter)
     labels: set[int] = field(default_factory=set)
-    gone: set[int] = field(default_factory=set)
+    gone: dict[int, tuple[int, float, float]] = field(default_factory=dict)
     confirmed: set[int] = field(default_factory=set)
+    read: set[int] = field(default_factory=set)
     problems: list[str] = field(default_factory=list)
     sizes_mib: list[float] = field(default_factory=list)
 
@@ -143,7 +148,8 @@ class Hour:
         self._random = np.random.default_rng(seed)
         self._beacons, self._lamps = make_clips(self._random)
         self._encoder = Evt3Encoder(WIDTH, HEIGHT)
-        self._live = LiveReceiver(Parameters(bit_rates=RATES, rate_search='listed'), 50_000_000, 100_000_000)
+        self._parameters = Parameters(bit_rates=RATES, rate_search='listed')
+        self._live = LiveReceiver(self._parameters, 50_000_000, 100_000_000)
         self._live.open(TYPE, STAMP_NS)
         self._seq = 0
         self._start_ns = 0
@@ -176,7 +182,8 @@ class Hour:
     def _take(self, step: Step) -> None:
         tally = self.tally
         for beacon in (*step.lost, *self._live.beacons()):
-            if beacon.track_id in tally.gone:
+            gone = tally.gone.pop(beacon.track_id, None)
+            if gone is not None and not self._may_be_back(beacon, *gone):
                 tally.problems.append(f'label {beacon.track_id} is back')
             tally.labels.add(beacon.track_id)
             if beacon.state is BeaconState.CONFIRMED:
@@ -185,15 +192,22 @@ class Hour:
                 tally.confirmed.add(beacon.track_id)
                 if self._beacon_at(beacon.track_id, beacon.t_ns - NS_PER_S, beacon.t_ns) is None:
                     tally.problems.append(f'{beacon.track_id} is confirmed at {self._places[beacon.track_id]}: no beacon')
-        tally.gone.update(beacon.track_id for beacon in step.lost)
+        tally.gone.update({one.track_id: (one.t_ns, one.x_px, one.y_px) for one in step.lost})
         for stamped in step.characters:
             if stamped.track_id in self._places and stamped.character.status is Status.OK:
                 t_ns = stamped.at.sensor_ns
                 shown = self._beacon_at(stamped.track_id, t_ns, t_ns)
                 right = shown is not None and self._is_right(shown, t_ns, stamped.character.code)
                 tally.counts['right' if right else 'wrong'] += 1
+                if right and shown is not None:
+                    tally.read.add(shown.start_ns)
         for beacon in step.lost:
             self._places.pop(beacon.track_id, None)
+
+    def _may_be_back(self, beacon: BeaconSnapshot, lost_ns: int, x_px: float, y_px: float) -> bool:
+        """Return whether a lost track's label may be given again: near where it was, and soon."""
+        near = math.hypot(beacon.x_px - x_px, beacon.y_px - y_px) <= self._parameters.max_gate_px
+        return near and beacon.t_ns - lost_ns <= round((self._parameters.reacquire_s + PACKET_NS / NS_PER_S) * NS_PER_S)
 
     def _beacon_at(self, track_id: int, first_ns: int, last_ns: int) -> Shown | None:
         """Return the beacon that was where a confirmed track is, at some time from first to last (ns)."""
@@ -240,7 +254,7 @@ def main() -> int:
     took_s = time.monotonic() - begin_s
     counts = tally.counts
     print(f'{options.minutes:g} minutes of events in {took_s / 60:.1f}: {counts["events"] / 1e6:.0f} million')
-    print(f'{counts["beacons"]} beacons and {counts["lamps"]} lamps;', end=' ')
+    print(f'{counts["beacons"]} beacons, {len(tally.read)} of them confirmed and read, and {counts["lamps"]} lamps;', end=' ')
     print(f'{len(tally.labels)} labels, {len(tally.confirmed)} of them confirmed')
     print(f'characters of confirmed beacons: {counts["right"]} right and OK, {counts["wrong"]} wrong and OK')
     shown = [f'{size:.0f}' for size in tally.sizes_mib[:: max(len(tally.sizes_mib) // 12, 1)]]

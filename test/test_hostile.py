@@ -52,5 +52,5 @@ def test_files(tmp_path: Path) -> None:
 def test_beacons_come_and_go() -> None:
     tally = endurance.run(0.4, 3, quiet=True)
     assert tally.problems == []
-    assert len(tally.confirmed) >= tally.counts['beacons'] - 1 > 3
+    assert len(tally.read) >= tally.counts['beacons'] - 1 > 3
     assert tally.counts['right'] > 1000 > 100 * tally.counts['wrong']
