@@ -106,30 +106,43 @@ def variance_at(row, dt_s):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def likely_variance(row, dt_s):  # type: ignore[no-untyped-def]
-    """Return the variance of position (px²), one axis, and what it grows by within ``dt_s``; of the likely modes alone.
+def _mixture(row, least, total):  # type: ignore[no-untyped-def]
+    """Return the mean, the variance of an axis with the spread of the means, and the white acceleration of the likely modes.
 
-    The rarer the mode, the wider: all of them together are a safe gate, but no fair statement of the error.
+    ``least``: modes of no more weight are left out.  ``total``: weight of the others.
     """
-    total = x = y = vx = vy = 0.0
+    x = y = vx = vy = pp = pv = vv = noise = 0.0
     for j in range(MODES):
         w, at = row[WEIGHT + j], _MODE + j * _SIZE
-        if w > _LIKELY:
-            total += w
+        if w > least:
             x += w * row[at]
             y += w * row[at + 1]
             vx += w * row[at + 2]
             vy += w * row[at + 3]
     x, y, vx, vy = x / total, y / total, vx / total, vy / total
-    pp = pv = vv = noise = 0.0
     for j in range(MODES):
-        w, at = row[WEIGHT + j] / total, _MODE + j * _SIZE
-        if w * total > _LIKELY:
+        share, at = row[WEIGHT + j] / total, _MODE + j * _SIZE
+        if row[WEIGHT + j] > _LIKELY:
+            noise += share * ACCELERATION[j]
+        if row[WEIGHT + j] > least:
             ex, ey, evx, evy = row[at] - x, row[at + 1] - y, row[at + 2] - vx, row[at + 3] - vy
-            pp += w * (row[at + 4] + 0.5 * (ex * ex + ey * ey))
-            pv += w * (row[at + 5] + 0.5 * (ex * evx + ey * evy))
-            vv += w * (row[at + 6] + 0.5 * (evx * evx + evy * evy))
-            noise += w * ACCELERATION[j]
+            pp += share * (row[at + 4] + 0.5 * (ex * ex + ey * ey))
+            pv += share * (row[at + 5] + 0.5 * (ex * evx + ey * evy))
+            vv += share * (row[at + 6] + 0.5 * (evx * evx + evy * evy))
+    return x, y, vx, vy, pp, pv, vv, noise
+
+
+@njit(cache=True, nogil=True)
+def likely_variance(row, dt_s):  # type: ignore[no-untyped-def]
+    """Return the variance of position (px²), one axis, and what it grows by within ``dt_s``; of the likely modes alone.
+
+    The rarer the mode, the wider: all of them together are a safe gate, but no fair statement of the error.
+    """
+    total = 0.0
+    for j in range(MODES):
+        if row[WEIGHT + j] > _LIKELY:
+            total += row[WEIGHT + j]
+    _, _, _, _, pp, pv, vv, noise = _mixture(row, _LIKELY, total)
     return pp, dt_s * (2.0 * pv + dt_s * (vv + noise * dt_s / 3.0))
 
 
@@ -213,17 +226,5 @@ def observe(row, t_s, dx, dy, variance):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _combine(row):  # type: ignore[no-untyped-def]
-    """Sum the modes up: mean, variance of an axis with the spread of the means, and white acceleration."""
-    row[X : NOISE + 1] = 0.0
-    for j in range(MODES):
-        w, at = row[WEIGHT + j], _MODE + j * _SIZE
-        for k in range(4):
-            row[X + k] += w * row[at + k]
-        if w > _LIKELY:
-            row[NOISE] += w * ACCELERATION[j]
-    for j in range(MODES):
-        w, at = row[WEIGHT + j], _MODE + j * _SIZE
-        ex, ey, evx, evy = row[at] - row[X], row[at + 1] - row[Y], row[at + 2] - row[VX], row[at + 3] - row[VY]
-        row[PP] += w * (row[at + 4] + 0.5 * (ex * ex + ey * ey))
-        row[PV] += w * (row[at + 5] + 0.5 * (ex * evx + ey * evy))
-        row[VV] += w * (row[at + 6] + 0.5 * (evx * evx + evy * evy))
+    """Sum the modes up."""
+    row[X], row[Y], row[VX], row[VY], row[PP], row[PV], row[VV], row[NOISE] = _mixture(row, -1.0, 1.0)
