@@ -157,7 +157,6 @@ class CandidateSlots:
         self._tried: dict[int, _Tried] = {}
         self._slots_full = False
         self._gaps = Gaps(2 * buffer_length_ns(parameters))
-        self._search_share = parameters.search_load
 
     def miss(self, start_ns: int, stop_ns: int) -> None:
         """Hear that the events of the stream from ``start_ns``, up to which it is known, to ``stop_ns`` (ns) are missing."""
@@ -194,11 +193,11 @@ class CandidateSlots:
         queue = self._queue(tracks)
         self._end_turns_that_are_over(t_ns, len(queue) - self._free)
         given = queue[: self._free]
-        self._share_search_load(len(given), t_ns)
+        search_load = self._share_search_load(len(given), t_ns)
         self._slots_full = len(queue) > len(given)
         received = []
         for track_id in given:
-            received += self._give(track_id, t_ns, *backlog(track_id))
+            received += self._give(track_id, t_ns, search_load, *backlog(track_id))
         for track_id, track in tracks.items():
             track.held = track_id in self._slots
             if track.held:
@@ -312,18 +311,21 @@ class CandidateSlots:
         slot = self._slots.pop(track_id)
         self._tried[track_id] = _Tried(t_ns, slot.record, slot.read_to_ns)
 
-    def _share_search_load(self, more: int, t_ns: int) -> None:
-        """Share what may be spent on searching among the slots without a bit rate, and so many more that are given now."""
+    def _share_search_load(self, more: int, t_ns: int) -> float:
+        """Share what may be spent on searching among the slots without a bit rate, and so many more; return each one's."""
         searching = [
             slot.demodulator
             for slot in self._slots.values()
             if isinstance(slot.demodulator, Searching) and slot.demodulator.bit_rate_bps is None
         ]
-        self._search_share = self._p.search_load / max(1, len(searching) + more)
+        load = self._p.search_load / max(1, len(searching) + more)
         for demodulator in searching:
-            demodulator.share(self._search_share, t_ns)
+            demodulator.share(load, t_ns)
+        return load
 
-    def _give(self, track_id: int, t_ns: int, times: Times, polarity: Polarities) -> list[ReceivedCharacter]:
+    def _give(
+        self, track_id: int, t_ns: int, search_load: float, times: Times, polarity: Polarities
+    ) -> list[ReceivedCharacter]:
         tried = self._tried.pop(track_id, None)
         read_to_ns = None if tried is None else tried.read_to_ns
         first = 0 if read_to_ns is None else int(np.searchsorted(times, read_to_ns, 'left'))
@@ -331,7 +333,7 @@ class CandidateSlots:
         self._slots[track_id] = slot
         slot.record.advance(t_ns, quiet=False)
         if isinstance(slot.demodulator, Searching):
-            slot.demodulator.share(self._search_share, t_ns)
+            slot.demodulator.share(search_load, t_ns)
             if tried is not None:
                 slot.demodulator.searched(tried.ended_ns)
         received = []

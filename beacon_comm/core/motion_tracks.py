@@ -187,13 +187,12 @@ class MotionTrack(Track):
             return None
         return None if before.fits(self) else before
 
-    def return_to(self, x_px: float, y_px: float, t_ns: int, variance_px2: float) -> None:
+    def return_to(self, x_px: float, y_px: float, t_ns: int, variance_px2: float, before: Steady) -> None:
         """Be at a place again at ``t_ns`` (ns), with the velocity from before the jump."""
-        if self.steady is not None:
-            vx, vy = self.steady.vx_px_per_s, self.steady.vy_px_per_s
-            motion.begin(self.row, (t_ns - self.origin_ns) / NS_PER_S, x_px, y_px, vx, vy, variance_px2, _JUMP_PX_PER_S**2)
-            self.settle()
-            self.steady = Steady(x_px, y_px, vx, vy, t_ns)
+        vx, vy = before.vx_px_per_s, before.vy_px_per_s
+        motion.begin(self.row, (t_ns - self.origin_ns) / NS_PER_S, x_px, y_px, vx, vy, variance_px2, _JUMP_PX_PER_S**2)
+        self.settle()
+        self.steady = Steady(x_px, y_px, vx, vy, t_ns)
 
     def stop(self, x_px: float, y_px: float, t_ns: int) -> None:
         """Wait at a place from ``t_ns`` (ns) on."""
@@ -405,7 +404,7 @@ class MotionTracker(Tracker):
             for entry in left:
                 blob = blobs[entry[1]]
                 if math.dist(before.position_at(blob.t_ns), (blob.x_px, blob.y_px)) <= gate:
-                    track.return_to(blob.x_px, blob.y_px, blob.t_ns, blob.variance_px2 + FLOOR_PX**2)
+                    track.return_to(blob.x_px, blob.y_px, blob.t_ns, blob.variance_px2 + FLOOR_PX**2, before)
                     left = [other for other in left if other is not entry]
                     break
             else:
