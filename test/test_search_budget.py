@@ -34,6 +34,13 @@ def test_the_bucket_holds_no_more_than_a_burst() -> None:
     assert budget.ready_at(100.0 * NS) == pytest.approx(100.2 * NS)
 
 
+def test_whoever_shares_the_load_has_a_smaller_bucket() -> None:
+    budget = SearchBudget(0.5)
+    budget.set_load(0.05, 0.0)
+    budget.spend((0.05 * BURST_S + 0.05) / BIT_COST_S, 0)
+    assert budget.ready_at(0.0) == pytest.approx(1.0 * NS)
+
+
 def clutter(parameters: Parameters, monkeypatch: pytest.MonkeyPatch, tracks: int, seconds: float) -> float:
     """Return the nominal computing time that the slots spend on blobs of noise (s)."""
     spent = [0.0]

@@ -14,7 +14,7 @@ Costs are nominal, from the window's bits and events, and nothing is measured, s
 
 from __future__ import annotations
 
-BURST_S = 0.3
+BURST_S = 0.15
 """A full bucket holds the share of so much event time (s)."""
 
 BIT_COST_S, EVENT_COST_S = 25e-6, 30e-9
@@ -37,6 +37,7 @@ class SearchBudget:
         """Let the level rise at another rate from the time ``t`` on."""
         self._rise_to(t)
         self._load = load
+        self._level_s = min(self._level_s, load * BURST_S)
 
     def ready_at(self, t: float) -> float:
         """Return when the next look may be, ``t`` or later."""
