@@ -39,8 +39,12 @@ SEEN_MARGIN = 4.0
 READABLE_MARGIN = 3.0
 """A word with an erased bit that beats the next one by less (nat) is not given out: it would be invented."""
 
-LEAST_FIT = 8.0
-"""A word whose bits are so much less likely (nat a bit) than usual is not ok: other light, and noise, can look like bits."""
+LEAST_FIT, FEW_WORDS = 8.0, 4
+"""A word whose bits are so much less likely (nat a bit) than usual is not ok: other light, and noise, can look like bits.
+Twice as much where the tables are of so few words: words that were learnt from fit too well."""
+
+UNSEEN_FALL = 15.0
+"""A word is not ok that is so much likelier (nat) to follow a 0 than a 1."""
 
 LEAST_EVENTS = 0.1
 """A word with less than this share of the events that its bits should have is read into a silence: it is not given out.
@@ -432,8 +436,12 @@ def _decide_word(clock, state, layout, length, best, at, lag, row):  # type: ign
     if _events_share(state, contexts, first) < LEAST_EVENTS:
         row[WORD], row[KIND] = word, KIND_UNREADABLE
         return
-    alike = fit >= state.levels[USUAL] - LEAST_FIT
-    passes = alike and (frame_margin >= OK_FRAME_MARGIN or (word == free and not erased))
+    alike = fit >= state.levels[USUAL] - LEAST_FIT * (1.0 + FEW_WORDS / max(numbers[LEARNT], 1))
+    # A word that is read into what was dark before has no fall: neither the free bits nor the frame look at what lies before.
+    start, then, data = likelihoods[0], likelihoods[1], contexts[1] & 1
+    fall = max(start[2], start[6]) + then[4 + data] - max(start[0], start[4]) - then[data]
+    falls = fall > -UNSEEN_FALL
+    passes = alike and falls and (frame_margin >= OK_FRAME_MARGIN or (word == free and not erased))
     if passes:
         numbers[DOUBT] = max(0, numbers[DOUBT] - length)
     elif not erased:
