@@ -231,6 +231,11 @@ def test_verdict():
     for refused in ({'failing': 5.0}, {'place_margin': 1.0}, {'oversampled': 0.95}, {'passing': 0, 'failing': 3.0}):
         assert not verdict(**refused).convinces
     assert verdict(passing=40, failing=20.0).convinces  # a weak signal, but a long one
+    assert verdict(passing=3, failing=2.0, cost=10.0).convinces  # a short one, of which words nearly pass
+    for refused in ({'cost': 20.0}, {'place_margin': 20.0}, {'spread': 0.2}, {'failing': 4.0}):
+        assert not verdict(**{'passing': 3, 'failing': 2.0, 'cost': 10.0, **refused}).convinces
+    assert Demands(5).met(verdict(passing=3, failing=2.0, cost=10.0))
+    assert not Demands(6).met(verdict(passing=3, failing=2.0, cost=10.0))
     assert verdict(covered=50, spread=0.05).full  # sharp edges, with pauses between the characters
     for not_full in ({'covered': 50, 'spread': 0.15}, {'covered': 50, 'failing': 4.0}, {'passing': 3}, {'changes': 1.5}):
         assert not verdict(**not_full).full

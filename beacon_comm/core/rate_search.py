@@ -37,14 +37,14 @@ LISTED_SPREAD = 0.025
 PERIOD_STEP = 0.15
 """Periods are tried so close that the window's ends move by so much (bit)."""
 
-LISTED_ATTEMPTS = (5, 6, 7, 8, 10, 12, 15, 18, 22, 26, 30)
-BLIND_ATTEMPTS = (12, 16, 20, 25)
+LISTED_ATTEMPTS = (5.0, 5.3, 5.6, 6.0, 6.5, 7.0, 8.0, 10.0, 12.0, 15.0, 18.0, 22.0, 26.0, 30.0)
+BLIND_ATTEMPTS = (12.0, 16.0, 20.0, 25.0)
 """Attempts are made so many characters after the first event …"""
 
-LATER_STEP, LATER_SHARE = 6, 0.4
+LATER_STEP, LISTED_LATER_SHARE, BLIND_LATER_SHARE = 6, 0.2, 0.4
 """… and then after so many more, or after this share of all so far if that is more."""
 
-MOST_STEP, BLIND_STEP_NS = 50.0, 0.5 * NS_PER_S
+MOST_LISTED_STEP, MOST_BLIND_STEP, MOST_BLIND_STEP_NS = 20.0, 50.0, 0.5 * NS_PER_S
 """Attempts are at most so many characters apart, so that nothing is out of reach; blind ones, that cost more, or so long."""
 
 BLIND_OCTAVES = (5000.0, 2500.0, 1250.0, 625.0, 312.5, 156.25, 100.0)
@@ -86,22 +86,32 @@ class RateSearch:
         frame: character frame.
         demands: what a lock has to show.
         attempts: number of characters after the first event at which attempts are made, the first ones.
+        later_share: the later ones are so much of all so far apart (share) …
+        most_step: … and at most so many characters.
 
     Attributes:
         period: nominal period of a bit, or the longest of several (ns).
         demands: what a lock has to show.
-        most_step: attempts are at most so many characters apart.
         longest: events so far back may still be needed (ns).
         wanted: when the next attempt was to be made, had it not been postponed (ns).
     """
 
-    def __init__(self, bit_rate_bps: float, frame: CharacterFrame, demands: Demands, attempts: tuple[int, ...]) -> None:
+    def __init__(
+        self,
+        bit_rate_bps: float,
+        frame: CharacterFrame,
+        demands: Demands,
+        attempts: tuple[float, ...],
+        later_share: float,
+        most_step: float,
+    ) -> None:
         self.period = NS_PER_S / bit_rate_bps
         self.demands = demands
         self._character = frame.duration_ns(bit_rate_bps)
         self._length = frame.length
         self._attempts = attempts
-        self.most_step = MOST_STEP
+        self._later_share = later_share
+        self._most_step = most_step
         self.longest = KEPT_CHARACTERS * self._character
         self.restart(0.0)
 
@@ -109,7 +119,7 @@ class RateSearch:
         """Begin anew with a first event at ``t``."""
         self._made = 0
         self._since = t
-        self._at = float(self._attempts[0])
+        self._at = self._attempts[0]
         self.wanted = self.due
 
     @property
@@ -161,9 +171,10 @@ class RateSearch:
         """Go on to the next attempt."""
         self._made += 1
         if self._made < len(self._attempts):
-            self._at = max(float(self._attempts[self._made]), self._at + 1.0)
+            apart = self._attempts[self._made] - self._attempts[self._made - 1]
+            self._at = max(self._attempts[self._made], self._at + min(1.0, apart))
         else:
-            self._at += min(max(LATER_STEP, self._at * LATER_SHARE), self.most_step)
+            self._at += min(max(LATER_STEP, self._at * self._later_share), self._most_step)
         self.wanted = self.due
 
 
@@ -171,7 +182,7 @@ class ListedSearch(RateSearch):
     """Looks for a listed rate (bit/s)."""
 
     def __init__(self, bit_rate_bps: float, frame: CharacterFrame) -> None:
-        super().__init__(bit_rate_bps, frame, LISTED_DEMANDS, LISTED_ATTEMPTS)
+        super().__init__(bit_rate_bps, frame, LISTED_DEMANDS, LISTED_ATTEMPTS, LISTED_LATER_SHARE, MOST_LISTED_STEP)
 
     def periods(self, t: NDArray[np.float64], polarity: NDArray[np.int8]) -> Iterator[NDArray[np.float64]]:
         """Yield the periods around the nominal one."""
@@ -183,8 +194,8 @@ class OctaveSearch(RateSearch):
     """Looks for any rate from the slowest one to twice that (bit/s)."""
 
     def __init__(self, slowest_bps: float, frame: CharacterFrame) -> None:
-        super().__init__(slowest_bps, frame, BLIND_DEMANDS, BLIND_ATTEMPTS)
-        self.most_step = max(MOST_STEP, BLIND_STEP_NS / self._character)
+        most_step = max(MOST_BLIND_STEP, MOST_BLIND_STEP_NS / frame.duration_ns(slowest_bps))
+        super().__init__(slowest_bps, frame, BLIND_DEMANDS, BLIND_ATTEMPTS, BLIND_LATER_SHARE, most_step)
 
     def periods(self, t: NDArray[np.float64], polarity: NDArray[np.int8]) -> Iterator[NDArray[np.float64]]:
         """Yield the surroundings of the periods that autocorrelation and spectra name."""
