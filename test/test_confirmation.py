@@ -72,18 +72,26 @@ def test_a_candidate_is_judged_by_its_last_five_parities(last: list[Status], hap
     assert record.demoted == bool(happened)
 
 
-@pytest.mark.parametrize(('flipped', 'happened'), [((), {}), ((8,), {15: Verdict.REJECTED})])
-def test_a_repaired_parity_is_right_if_the_bits_say_so_without_the_frame(
-    flipped: tuple[int, ...], happened: dict[int, Verdict]
+@pytest.mark.parametrize(
+    ('flipped', 'confidence', 'happened'),
+    [
+        ((), 0.5, {}),
+        ((), 0.95, {15: Verdict.CONFIRMED}),  # evidence that could have failed
+        ((8,), 0.5, {15: Verdict.REJECTED}),
+        ((8,), 0.95, {15: Verdict.REJECTED}),
+    ],
+)
+def test_a_repaired_character_counts_as_right_if_the_bits_say_so_without_the_frame_and_vouches_if_sure(
+    flipped: tuple[int, ...], confidence: float, happened: dict[int, Verdict]
 ) -> None:
     record = ParityRecord(Parameters())
-    sent = list(characters(TEXT[:15], [REPAIRED] * 15))
+    sent = list(characters(TEXT[:15], [REPAIRED] * 15, confidence=confidence))
     for k, character in enumerate(sent):
         bits = [character.frame >> shift & 1 for shift in range(FRAME.length - 1, -1, -1)]
         sent[k] = replace(character, bit_llr=tuple(2.0 * (bit ^ (place in flipped)) - 1.0 for place, bit in enumerate(bits)))
     assert sent[0].read_freely == (not flipped)
     assert verdicts(record, sent) == happened
-    assert not record.confirmed
+    assert record.confirmed == (Verdict.CONFIRMED in happened.values())
 
 
 def test_a_candidate_is_judged_again_every_fifteen() -> None:

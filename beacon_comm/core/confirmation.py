@@ -9,10 +9,11 @@ Every character that a demodulator gives out is *counted* (a silence gives none)
 
 A lamp is a valid sender, too: at each of its falls the same waveform lies ahead, so every character is synchronised
 and reads alike, with right parity if chance has it; an edge near the middle of a bit makes several codes of one.
-A line that changes at random gets one character in five ok.  So a character *vouches* for a beacon only if it is ok
-and did not slip in (see :meth:`ParityRecord.push`); the edges of those that vouch have to lie nearer to the borders
-of the bits than to their middles (their confidence); and their codes have to vary as a text's do (:func:`repeats`,
-:func:`regular_share`, :func:`comb_share`).  ``docs/confirmation.md`` works out what is left to chance.
+A line that changes at random gets one character in five ok.  So a character *vouches* for a beacon only if it is ok, or
+repaired though its bits say the same without the frame, and did not slip in (see :meth:`ParityRecord.push`); the edges
+of those that vouch have to lie nearer to the borders of the bits than to their middles (their confidence); and their
+codes have to vary as a text's do (:func:`repeats`, :func:`regular_share`, :func:`comb_share`).
+``docs/confirmation.md`` works out what is left to chance.
 """
 
 from __future__ import annotations
@@ -113,7 +114,7 @@ class ParityRecord:
     def push(self, character: Character) -> Verdict:
         """Count a character, in order of time; a demoted record counts on, but gives no further verdict.
 
-        An ok character vouches unless it started more than half a bit early: a synchronised line brings characters a
+        A character that may vouch does so unless it started more than half a bit early: a synchronised line brings characters a
         whole frame apart, or further when it idles.
         """
         self._count(character)
@@ -158,12 +159,11 @@ class ParityRecord:
         self.repaired += status is Status.REPAIRED
         self.parity_errors += status is Status.PARITY_ERROR
         self.framing_errors += status is Status.FRAMING_ERROR
-        self._rights.append(
-            status is Status.OK
-            or (status is Status.FRAMING_ERROR and self._layout.parity_bits > 0)
-            or (status is Status.REPAIRED and character.read_freely)
-        )
-        vouches = status is Status.OK and not self._slipped(character)
+        free = status is Status.REPAIRED and character.read_freely
+        right = status is Status.OK or free or (status is Status.FRAMING_ERROR and self._layout.parity_bits > 0)
+        self._rights.append(right)
+        sure = status is Status.OK or (free and character.confidence >= self._p.confirm_free_confidence)
+        vouches = sure and not self._slipped(character)
         counted = _Counted(character.code, character.frame, character.confidence, character.edge_spread, vouches)
         self._window.append(counted)
         if vouches:

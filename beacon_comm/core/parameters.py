@@ -252,6 +252,9 @@ class Parameters(Declared):
     )
     confirm_window: int = parameter(15, 'a confirmation looks at so many last characters …', '', 1)
     confirm_ok: int = parameter(12, '… of which so many are ok …', '', 1)
+    confirm_free_confidence: float = parameter(
+        0.9, 'a repaired character whose bits say the same without the frame vouches, too, if it is so sure', '', 0.0, 1.0
+    )
     confirm_distinct_codes: int = parameter(4, '… with so many distinct codes …', '', 1)
     confirm_period: int = parameter(3, '… that do not repeat with a period of so many characters or less', '', 0)
     confirm_repeats: float = parameter(
