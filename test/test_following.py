@@ -12,6 +12,7 @@ from test_detection import in_pieces
 from beacon_comm.core import motion
 from beacon_comm.core.detection import Detector
 from beacon_comm.core.events import EventBatch
+from beacon_comm.core.following import _doubted
 from beacon_comm.core.motion_tracks import MotionTrack
 from beacon_comm.core.parameters import Parameters
 
@@ -238,3 +239,20 @@ def test_edges_that_pass_do_not_take_a_beacon_along(seed: int) -> None:
 
     detect(detector, merged(beacon, *edges), look)
     assert detector.tracks[1].position_at(T0_NS + 600_000_000) == pytest.approx((160.0, 120.0), abs=1.0)
+
+
+def test_an_observation_that_is_far_off_for_once_is_doubted() -> None:
+    def row(speed: float) -> np.ndarray:
+        state = np.zeros(motion.WIDTH)
+        motion.begin(state, 0.0, 100.0, 100.0, speed, 0.0, 0.01, 100.0)
+        state[motion.EXTENT] = 4.0
+        return state
+
+    slow = row(300.0)
+    assert _doubted(slow, 1e-3, 0.1, 0.1, 0.04) == 0.04  # as expected
+    assert _doubted(slow, 1e-3, 3.0, -3.0, 0.04) == pytest.approx(0.04 + 2.0**2)  # half a radius: the first rows of a burst
+    assert _doubted(slow, 1e-3, 4.0, -2.0, 0.04) == 0.04  # again: it moves
+    assert _doubted(slow, 1e-3, 0.1, 0.0, 0.04) == 0.04
+    assert _doubted(slow, 1e-3, 3.0, 3.0, 0.04) > 4.0
+    assert _doubted(slow, 1e-3, -3.0, -3.0, 0.04) > 4.0  # to the other side is not again
+    assert _doubted(row(3000.0), 1e-3, 4.0, 4.0, 0.04) == 0.04  # a fast one may have turned back

@@ -39,6 +39,8 @@ from beacon_comm.core import motion
 from beacon_comm.core.events import NS_PER_S, EventBatch
 from beacon_comm.core.hop_events import ROUTED, HopEvents
 from beacon_comm.core.motion import (
+    DOUBTED_X,
+    DOUBTED_Y,
     EXTENT,
     HIDDEN,
     HOP_OFF,
@@ -81,6 +83,8 @@ _LEAST_TRUST, _MOST_TRUST = 0.15, 10.0
 _SHARED = 2.0  # events that may be another track's tell so much less
 _EITHER = 12  # so many of either polarity tell how far they are apart
 _LEAD_GAIN = 0.05
+_DOUBTED = 9.0  # an observation so much farther off than expected (squared), and than what turns back since the last one, …
+_OFF_SHARE = 0.5  # … may be of the first rows of a burst alone: off by so much of the radius (standard deviation)
 _BALANCE = 0.2  # a share of ON events so much unlike the usual one is a burst of one polarity …
 _SMALL_LEAD = 1.0  # … worth waiting for the other one where it is off by more than this, over the variance, …
 _MOST_EVENTS = 4000  # … for no more than so many events …
@@ -341,11 +345,29 @@ def _update(row, doubt, at_once):  # type: ignore[no-untyped-def]
         return False
     variance += 0.5 * lead2
     row[N_OFF : SINCE + 1] = 0.0
+    variance = _doubted(row, dt, dx, dy, variance)
     error, part = observe(row, dt, dx, dy, variance * doubt)
     if doubt == 1.0:
         trust = row[TRUST] * math.exp(_TRUST_GAIN * part * (min(error, _MOST_ERROR) - 1.0))
         row[TRUST] = min(max(trust, _LEAST_TRUST), _MOST_TRUST)
     return True
+
+
+@njit(cache=True, nogil=True)
+def _doubted(row, t_s, dx, dy, variance):  # type: ignore[no-untyped-def]
+    """Return the variance of an observation: greater for the first one that is far off.
+
+    What turns back is off again and again; the rows of a burst that are read out first are off for once, and the velocity
+    would jump.
+    """
+    since_s = max(0.0, t_s - row[T])
+    error = 0.5 * (dx * dx + dy * dy) / (variance_at(row, since_s) + variance)
+    again = row[DOUBTED_X] * dx + row[DOUBTED_Y] * dy > 0.0
+    row[DOUBTED_X] = row[DOUBTED_Y] = 0.0
+    if error <= _DOUBTED or np.hypot(dx, dy) <= 2.0 * np.hypot(row[VX], row[VY]) * since_s:
+        return variance
+    row[DOUBTED_X], row[DOUBTED_Y] = dx, dy
+    return variance if again else variance + (_OFF_SHARE * row[EXTENT]) ** 2
 
 
 @njit(cache=True, nogil=True)

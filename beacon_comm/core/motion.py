@@ -63,7 +63,9 @@ SHORT_ON, SHORT_OFF, LONG_ON, LONG_OFF = range(LAST + 1, LAST + 5)
 EXTENT, HIDDEN, USUAL, LEAD2, TRUST = range(LONG_OFF + 1, LONG_OFF + 6)
 # The last observation's error over its standard deviation, and how much of it comes again in the next one.
 ERROR_X, ERROR_Y, AGAIN = range(TRUST + 1, TRUST + 4)
-WIDTH = AGAIN + 1
+# The last observation's residual (px) if it was doubted, else 0.
+DOUBTED_X, DOUBTED_Y = range(AGAIN + 1, AGAIN + 3)
+WIDTH = DOUBTED_Y + 1
 
 
 @njit(cache=True, nogil=True)
