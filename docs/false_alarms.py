@@ -480,8 +480,8 @@ HEAD = """# False alarms: candidates that are no beacon
 
 Lamps, PWM dimming, moving edges and noise are not characters. The test: a *candidate* is {shortest:g} to {longest:g} s of one
 blob's events (patches of short bags as long as they are), drawn at random from a family below. It goes through the
-receiver with the default parameters, listed rates {rates} bps: slot, demodulator, parity record, confirmation, and new
-turns after each rejection for as long as it lasts. It is a **false alarm** if it is ever confirmed, and the false-alarm
+receiver with the default parameters but for `rate_search`, which is `listed` or `blind`; listed rates {rates} bps: slot, demodulator,
+parity record, confirmation, and new turns after each rejection for as long as it lasts. It is a **false alarm** if it is ever confirmed, and the false-alarm
 rate is the share of candidates that are. What is not confirmed may still give characters, which a node publishes as a
 candidate's: *ok* ones are counted too. *Gave characters* is how many candidates were read at all: a receiver that
 synchronises first has locked on them.
