@@ -622,6 +622,30 @@ def test_events_at_the_edges_alone_are_enough(bit_rate_bps, search):
     assert np.mean([c.status is Status.OK for c in characters]) > 0.5
 
 
+@pytest.mark.parametrize('silent_ms', [200, 400, 600, 900])
+def test_a_gap_before_a_silence_is_none_of_the_batches_business(silent_ms):
+    t_ns, polarity = beacon_events(text_bits(PROSE * 8), 3125.0)
+    gap_ns = 1_000_000_000, 1_010_000_000
+    behind = 1_010_000_000 + silent_ms * 1_000_000
+    before, after = t_ns < gap_ns[0], t_ns >= behind
+    reads = []
+    for step_ns in (10_000_000, 100_000_000, 2 * NS):
+        receiver = demodulator(3125.0)
+        characters = receiver.push(t_ns[before], polarity[before], gap_ns[0])
+        receiver.miss(*gap_ns)
+        cuts = range(gap_ns[1] + step_ns, int(t_ns[-1]), step_ns)
+        reads.append(characters + decode(receiver, t_ns[after], polarity[after], cuts=cuts))
+    assert len(reads[0]) > 300 and reads[0] == reads[1] == reads[2]
+
+
+def test_who_has_not_looked_has_not_given_up():
+    t_ns, polarity = beacon_events(text_bits(PROSE), 3125.0, lead_s=0.0)
+    receiver = demodulator(3125.0)
+    receiver.push(t_ns[t_ns < 8_000_000], polarity[t_ns < 8_000_000], 8_000_000)
+    receiver.miss(8_000_000, 308_000_000)
+    assert not receiver.given_up
+
+
 # --- real recordings ----------------------------------------------------------------------------------------------
 
 
@@ -660,7 +684,7 @@ def test_real_recordings_are_read(data_folder, sonnet, name, bit_rate_bps, tail,
 
 
 @pytest.mark.parametrize(('name', 'bit_rate_bps'), [('504hz_30m.mat', 504.0), ('3125hz_30m.mat', 3125.0)])
-def test_real_recordings_are_locked_within_five_characters(data_folder, name, bit_rate_bps):
+def test_real_recordings_are_mostly_locked_within_five_characters(data_folder, name, bit_rate_bps):
     t_ns, polarity = real_events(data_folder, name)
     sent = np.array([c.t_ns for c in decode(demodulator(bit_rate_bps), t_ns, polarity, 0)])
     bit_ns = round(NS / bit_rate_bps)

@@ -7,7 +7,8 @@ For a period T near the expected one, over a window of some characters::
     2. slicer    bit = more ON or more OFF; few events: as the bit before
     3. learning  histograms from the bits, bits from the histograms: free, then under the frame
     4. verdict   how many words of the framed path are also what the free bits say: those could have failed, as the
-                 histograms behind the free bits have not seen the frame
+                 histograms behind the free bits have not seen the frame; and by how much the place in the frame beats any
+                 other, by histograms that have
 
 The eye chooses among the periods around the expected one; the edges of the window then fit period and latencies.
 The LED may also be on for 0: the frame is looked for in the bits and in their complement.
@@ -180,7 +181,7 @@ class Demands(NamedTuple):
     """What a lock has to show.
 
     Attributes:
-        needed: words that have to pass.
+        needed: words that have to pass; where the frame costs hardly any likelihood those that nearly pass count, too.
         tried: so many of the periods are read, those with the widest eye.
         most_spread: standard deviation of the edges about the bit grid (bit); evenly spread ones, of another rate, have 0.29.
         least_changes: of level within passing words, mean.

@@ -68,8 +68,8 @@ NAMED_SPREAD = 0.004
 SHORT_WINDOW, LONG_WINDOW, LONGEST_WINDOW = 8, 25, 90
 """Characters of a window: later attempts take turns with them.  Pauses between the characters need long ones."""
 
-EXHAUSTED_AT = 60
-"""Nothing found in so many characters: there is no such beacon."""
+EXHAUSTED_AT, LEAST_LOOKS = 60, 4
+"""Nothing found in so many characters, and so many attempts: there is no such beacon."""
 
 KEPT_CHARACTERS = 130
 """Events so many characters of the slowest rate back are kept while it is sought."""
@@ -130,7 +130,7 @@ class RateSearch:
     @property
     def exhausted(self) -> bool:
         """Whether it has looked long enough."""
-        return self._at > EXHAUSTED_AT
+        return self._at > EXHAUSTED_AT and self._made >= LEAST_LOOKS
 
     def had_a_chance(self, now: float) -> bool:
         """Whether it has seen enough by ``now`` (ns) to find a beacon."""

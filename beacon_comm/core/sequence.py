@@ -47,6 +47,7 @@ from beacon_comm.core.sequence_detection import (
     WORD,
     detect,
     end_detection,
+    silent_since,
     start_at,
 )
 from beacon_comm.core.soft_decision import confidence_of, frame_layout
@@ -95,7 +96,8 @@ class SequenceDemodulator:
         self._gaps = np.empty((0, 2))  # whose events are missing
         self._known_to = -math.inf  # the stream's time
         self._taken = 0  # events of the buffer that the lock has seen
-        self._given_to = -math.inf  # end of the last character that was given out
+        self._given_to = -math.inf  # end of the last character that was given out …
+        self._read_to = -math.inf  # … or read, and not given out yet
         self._refine_at = math.inf  # time at which the lock is to be refined
         self._usable_from = -math.inf  # events before this are not read again
         self._found_at = -math.inf  # when the lock was found
@@ -186,14 +188,21 @@ class SequenceDemodulator:
 
     def flush(self) -> list[Character]:
         """End the stream; see :class:`beacon_comm.core.demodulator.Demodulator`."""
-        if self._lock is None and len(self._t):
-            self._attempt_all()
-        lock = self._lock
-        if lock is None:
-            return []
-        before = self._follow(lock, self._known_to)[1]
+        characters: list[Character] = []
+        while True:
+            if self._lock is None and len(self._t):
+                self._attempt_all()
+            lock = self._lock
+            if lock is None:
+                return characters
+            status, found = self._follow(lock, self._known_to)
+            characters += found
+            if status == STILL_LOCKED:
+                break
+            if status != FULL:
+                self._unlock(reread=status == LOST)
         count = end_detection(lock.clock, lock.detection, self._transitions, self._layout, self._rows)
-        characters = before + self._characters(self._rows[:count])
+        characters += self._characters(self._rows[:count])
         self._unlock(reread=True)
         self._ended = lock
         return characters
@@ -269,6 +278,7 @@ class SequenceDemodulator:
                     characters.append(pending)
                 characters.append(character)
                 self._trusted = True
+                self._given_to = self._read_to
             else:
                 self._pending = character  # perhaps read into what was there before the beacon
         return characters
@@ -276,9 +286,9 @@ class SequenceDemodulator:
     def _character(self, row: NDArray[np.float64]) -> Character | None:
         """Return the character of a row, None if it is not to be given out."""
         word, kind, period, start = int(row[WORD]), row[KIND], float(row[PERIOD_THEN]), float(row[BORDER_OF_START])
-        if kind == KIND_UNREADABLE or start < self._given_to - 0.5 * self._frame.length * period:
+        if kind == KIND_UNREADABLE or start < self._read_to - 0.5 * self._frame.length * period:
             return None
-        self._given_to = start + self._frame.length * period
+        self._read_to = start + self._frame.length * period
         code, status = self._decode[word]
         if kind in (KIND_SEEN, KIND_REPAIRED):
             status = Status.REPAIRED
@@ -373,6 +383,7 @@ class SequenceDemodulator:
         border = float(lock.clock.values[BORDER])
         self._trusted = False
         self._pending = None
+        self._read_to = self._given_to
         self._found_at = now
         self._refine_at = border + REFINED_AFTER * self._frame.length * lock.period
         if len(lock.positions) > (REFINED_AFTER - 5) * self._frame.length:
@@ -413,6 +424,8 @@ class SequenceDemodulator:
             needed_from = t_end - self._longest
             first = max(int(np.searchsorted(self._t, needed_from)), len(self._t) - self._most_events)
         if len(self._gaps):
+            if self._lock is not None:  # how the next event is taken depends on whether the silence was one
+                needed_from = min(needed_from, silent_since(self._lock.clock, self._lock.detection))
             self._gaps = self._gaps[self._gaps[:, 1] > needed_from]
         self._events.drop(first)
         self._taken -= first

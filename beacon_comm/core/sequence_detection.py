@@ -255,6 +255,12 @@ def _missing(gaps, start, stop):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def silent_since(clock, state):  # type: ignore[no-untyped-def]
+    """Return since when (ns from the origin) there has been no event; the present bit not counted."""
+    return clock.values[BORDER] - state.numbers[SILENT_RUN] * clock.values[PERIOD]
+
+
+@njit(cache=True, nogil=True)
 def _wake(clock, state, transitions, gaps, t):  # type: ignore[no-untyped-def]
     """Go on just before an event after a long silence.
 
@@ -265,8 +271,7 @@ def _wake(clock, state, transitions, gaps, t):  # type: ignore[no-untyped-def]
         whether the clock still says where the bits begin.
     """
     values, numbers, length = clock.values, state.numbers, transitions.length
-    silent_since = values[BORDER] - numbers[SILENT_RUN] * values[PERIOD]
-    in_gap = _missing(gaps, silent_since, t)
+    in_gap = _missing(gaps, silent_since(clock, state), t)
     skipped = max(np.floor((t - values[BORDER]) / values[PERIOD]) - 1.0, 0.0)
     if skipped > 0.0:
         go_on(clock, skipped)

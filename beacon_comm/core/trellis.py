@@ -128,14 +128,13 @@ UNLIKELY = -1e30
 
 @njit(cache=True, nogil=True)
 def free_step(metric, best, likelihoods):  # type: ignore[no-untyped-def]
-    """Advance the free trellis by one bit; ``best[context]`` becomes the bit that left the context."""
+    """Advance the free trellis by one bit; ``best[context]`` becomes the context before on its best path."""
     fresh = np.empty(CONTEXTS)
     top = UNLIKELY
     for context in range(CONTEXTS):
         low = context >> 1
         high = low | CONTEXTS >> 1
-        oldest = 1 if metric[high] > metric[low] else 0
-        best[context] = high if oldest else low
+        best[context] = high if metric[high] > metric[low] else low
         fresh[context] = metric[best[context]] + likelihoods[context]
         top = max(top, fresh[context])
     for context in range(CONTEXTS):
