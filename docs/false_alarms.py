@@ -480,10 +480,11 @@ HEAD = """# False alarms: candidates that are no beacon
 
 Lamps, PWM dimming, moving edges and noise are not characters. The test: a *candidate* is {shortest:g} to {longest:g} s of one
 blob's events (patches of short bags as long as they are), drawn at random from a family below. It goes through the
-receiver with the default parameters but for `rate_search`, which is `listed` or `blind`; listed rates {rates} bps: slot, demodulator,
-parity record, confirmation, and new turns after each rejection for as long as it lasts. It is a **false alarm** if it is ever confirmed, and the false-alarm
-rate is the share of candidates that are. What is not confirmed may still give characters, which a node publishes as a
-candidate's: *ok* ones are counted too. *Gave characters* is how many candidates were read at all: a receiver that
+receiver with the default parameters but for `rate_search`, which is `listed` or `blind`; listed rates {rates} bps: slot,
+demodulator, parity record, confirmation, and new turns after each rejection for as long as it lasts. It is a **false alarm**
+if it is ever confirmed, and the false-alarm rate is the share of candidates that are. What is not confirmed may still give
+characters, which a node publishes as a candidate's: *ok* ones are counted too, and say that a lamp reads like characters, not
+that it is a beacon. *Gave characters* is how many candidates were read at all: a receiver that
 synchronises first has locked on them.
 
 Simulated families draw their lamp anew each time: 3 to 330 events a transition, spread over 1 µs to 1 ms, with and without
