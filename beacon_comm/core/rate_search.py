@@ -2,7 +2,7 @@
 
 ::
 
-    first event ─►│ 5 characters │ 6 │ 7 │ 8 │ 10 │ 12 │ … attempts; rarer when nothing is found
+    first event ─►│ 5 characters │ 5.3 │ 5.6 │ 6 │ … 10 │ 12 │ … attempts; rarer when nothing is found
                   ├── window ────┤
                   ├──── window ──────┤
 
