@@ -80,7 +80,7 @@ def test_the_window_is_of_the_last_looks_and_memory_is_bounded() -> None:
 
 @pytest.mark.parametrize(
     ('receiver', 'bit_rates', 'read_back'),
-    [('sequence', (3125.0,), 5), ('threshold', (504.0, 3125.0), 10), ('threshold', (3125.0,), 0)],
+    [('sequence', (3125.0,), 3), ('threshold', (504.0, 3125.0), 10), ('threshold', (3125.0,), 0)],
 )
 def test_characters_count_that_fell_due_while_they_were_read(
     receiver: str, bit_rates: tuple[float, ...], read_back: int
