@@ -300,8 +300,8 @@ def _read(
                 inverted, path, likelihood = turned, other, its_likelihood
     if path is None:
         return None
+    cost = _log_likelihood(likelihoods, free) - likelihood
     free = free ^ inverted
-    cost = _log_likelihood(likelihoods, free ^ inverted) - likelihood
     passing, failing, _ = _judge(path, free, transitions.length)
     hopeful = passing >= needed and failing <= HOPEFUL * passing
     if not hopeful and (passing + failing < needed or cost > CHEAP_COST * (passing + failing)):
