@@ -439,9 +439,9 @@ def test_batches_give_the_same_characters_where_little_is_spent_on_searching(rat
 
 
 def test_where_little_is_spent_on_searching_a_beacon_is_found_later():
-    t_ns, polarity = beacon_events(text_bits(PROSE * 5), 1250.0)
+    t_ns, polarity = beacon_events(text_bits(PROSE * 15), 1250.0)
     known = []
-    for load in (0.05, 1.0):
+    for load in (0.02, 1.0):
         receiver, found_ns = demodulator(504.0, 3125.0, search='both', search_load=load), None
         for cut_ns in range(0, int(t_ns[-1]), 10_000_000):
             part = slice(*np.searchsorted(t_ns, (cut_ns, cut_ns + 10_000_000)))
