@@ -6,15 +6,11 @@ from line_events import text_bits
 from sequence_lines import NS, beacon_events
 
 from beacon_comm.core.acquisition import Demands, acquire
-from beacon_comm.core.bit_clock import BORDER, PERIOD
 from beacon_comm.core.framing import CharacterFrame
-from beacon_comm.core.likelihood import compression_table
 from beacon_comm.core.sequence_detection import (
-    ASLEEP,
     BORDER_OF_START,
     FIRST_RATIO,
     FULL,
-    GAIN,
     KIND,
     KIND_NOISE,
     KIND_OK,
@@ -27,13 +23,12 @@ from beacon_comm.core.sequence_detection import (
     end_detection,
     start_at,
 )
-from beacon_comm.core.soft_decision import frame_layout
-from beacon_comm.core.trellis import framed_transitions
+from beacon_comm.core.trellis import frame_layout
 from beacon_comm.simulation.led import noise
 
 TEXT = "Rough winds do shake the darling buds of May,\nAnd summer's lease hath all too short a date:\n"
 FRAME = CharacterFrame()
-TRANSITIONS, LAYOUT = framed_transitions(FRAME), frame_layout(FRAME)
+LAYOUT = frame_layout(FRAME)
 RATE_BPS = 1000.0
 BIT = 1e6
 
@@ -43,7 +38,7 @@ class Locked:
 
     def __init__(self, t, polarity, learnt_from=20, rows=512):
         window = slice(0, int(np.searchsorted(t, t[0] + (learnt_from * 11 + 5) * BIT)))
-        lock = acquire(t[window], polarity[window], np.array([BIT]), TRANSITIONS, compression_table(), Demands(4))
+        lock = acquire(t[window], polarity[window], np.array([BIT]), LAYOUT, Demands(4))
         assert lock is not None
         self.clock, self.state, self.inverted = lock.clock, lock.detection, lock.inverted
         start_at(self.state, int(lock.positions[0]), 11)
@@ -57,7 +52,6 @@ class Locked:
             count, taken, status = detect(
                 self.clock,
                 self.state,
-                TRANSITIONS,
                 LAYOUT,
                 self.inverted,
                 t[first:],
@@ -72,7 +66,7 @@ class Locked:
                 return np.concatenate(found), status
 
     def end(self):
-        return self.rows[: end_detection(self.clock, self.state, TRANSITIONS, LAYOUT, self.rows)].copy()
+        return self.rows[: end_detection(self.clock, self.state, LAYOUT, self.rows)].copy()
 
 
 def stream(text=TEXT, **options):
@@ -135,12 +129,11 @@ def test_a_long_silence_costs_nothing_and_the_clock_goes_on():
     rows, _ = locked.push(t, polarity, t[-1])
     bits = 3_600_000
     rows, status = locked.push(t[:0], polarity[:0], t[-1] + bits * BIT)  # an hour
-    assert status == STILL_LOCKED and locked.state.numbers[ASLEEP] == 1
-    border, period = locked.clock.values[[BORDER, PERIOD]]
-    assert border < t[-1] + 200 * BIT  # it sleeps
+    assert status == STILL_LOCKED and locked.state['asleep'][0]
+    assert locked.clock['border'][0] < t[-1] + 200 * BIT  # it sleeps
     later = t + round(bits * 1.0) * BIT
     more, status = locked.push(later, polarity, later[-1])
-    assert status == STILL_LOCKED and locked.state.numbers[ASLEEP] == 0
+    assert status == STILL_LOCKED and not locked.state['asleep'][0]
     # An hour of a clock known to some ppm is many bits: the place is found anew.
     assert said(np.concatenate([more, locked.end()])).endswith(TEXT[20:])
 
@@ -153,9 +146,9 @@ def test_noise_freezes_the_clock_and_loses_the_lock():
     garbage, sign = noise(60_000.0, 2.0, t0_ns=round(t[-1]), seed=1)
     rows, status = locked.push(garbage.astype(np.float64), sign, float(garbage[-1]))
     assert status == LOST
-    assert locked.clock.frozen[0]
-    assert locked.clock.values[PERIOD] == pytest.approx(BIT, rel=5e-3)
-    assert locked.clock.values[BORDER] < t[-1] + 60 * 11 * BIT
+    assert locked.clock['frozen'][0]
+    assert locked.clock['period'][0] == pytest.approx(BIT, rel=5e-3)
+    assert locked.clock['border'][0] < t[-1] + 60 * 11 * BIT
     new = rows[rows[:, BORDER_OF_START] > t[-1]]
     assert KIND_OK not in new[:, KIND]
     assert (new[new[:, KIND] == KIND_NOISE][:, MARGIN] == 0.0).all()
@@ -170,10 +163,10 @@ def test_the_gain_follows_the_strength(before, after):
     locked = Locked(t, polarity)
     first = t < changes_at
     locked.push(t[first], polarity[first], changes_at)
-    gain = locked.state.levels[GAIN]
+    gain = float(locked.state['gain'][0])
     rows, status = locked.push(t[~first], polarity[~first], t[-1])
     assert status == STILL_LOCKED
-    assert locked.state.levels[GAIN] / gain == pytest.approx(after / before, rel=0.25)
+    assert locked.state['gain'][0] / gain == pytest.approx(after / before, rel=0.25)
     assert said(np.concatenate([rows, locked.end()])).endswith(TEXT * 2)
 
 

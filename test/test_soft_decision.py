@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from beacon_comm.core.character import Status
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.likelihood import CONTEXTS, MEMORY_BITS
-from beacon_comm.core.soft_decision import bit_ratios, confidence_of, frame_layout, margins
+from beacon_comm.core.soft_decision import bit_ratios, confidence_of, margins
+from beacon_comm.core.trellis import frame_layout
 
 FRAMES = [
     CharacterFrame(),
@@ -74,7 +75,7 @@ def test_margins_against_all_words(case, decides_the_best, choice):
     frames = is_frame(frame)
     candidates = np.flatnonzero(frames)
     word = candidates[values[candidates].argmax()] if decides_the_best else candidates[choice % len(candidates)]
-    frame_margin, word_margin = margins(likelihoods, before, after, int(word), frame_layout(frame))
+    frame_margin, word_margin = margins(likelihoods, before, after, int(word), frame_layout(frame)[0])
     rivals = frames.copy()
     rivals[word] = False
     assert frame_margin == pytest.approx(values[word] - values[~frames].max(), abs=1e-9)
@@ -84,17 +85,18 @@ def test_margins_against_all_words(case, decides_the_best, choice):
 
 @pytest.mark.parametrize('frame', FRAMES, ids=str)
 def test_layout_allows_the_frames_and_no_other_word(frame):
-    layout = frame_layout(frame)
-    assert len(layout.fixed) == len(layout.checked) == frame.length
+    layout = frame_layout(frame)[0]
+    assert layout['length'] == frame.length
+    fixed, checked = layout['fixed'][: frame.length], layout['checked'][: frame.length] == 1
     bits = np.arange(1 << frame.length)[:, None] >> np.arange(frame.length - 1, -1, -1) & 1
-    allowed = ((layout.fixed < 0) | (bits == layout.fixed)).all(axis=1)
-    if layout.parity >= 0:
-        allowed &= bits[:, layout.checked].sum(axis=1) % 2 == layout.parity
-    assert allowed.tolist() == is_frame(frame).tolist()
+    allowed = ((fixed < 0) | (bits == fixed)).all(axis=1)
+    if layout['parity'] >= 0:
+        allowed &= bits[:, checked].sum(axis=1) % 2 == layout['parity']
+    assert allowed.tolist() == is_frame(frame).tolist() == (layout['words'][: len(bits)] == 1).tolist()
 
 
 def test_no_evidence_is_no_margin():
-    layout = frame_layout(CharacterFrame())
+    layout = frame_layout(CharacterFrame())[0]
     assert margins(np.zeros((13, CONTEXTS)), 7, 3, CharacterFrame().frame_of(ord('S')), layout) == (0.0, 0.0)
 
 

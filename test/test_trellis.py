@@ -18,8 +18,8 @@ from beacon_comm.core.trellis import (
     NOISE_COST,
     NOISE_EXIT_COST,
     NOISE_STAY_COST,
+    frame_layout,
     framed_path,
-    framed_transitions,
     free_bits,
     place_margin,
 )
@@ -43,7 +43,7 @@ SHORT_FRAMES = [
 
 def path_of(likelihoods, frame):
     """Return positions and bits of the framed path."""
-    path, _ = framed_path(framed_transitions(frame), likelihoods)
+    path, _ = framed_path(frame_layout(frame), likelihoods)
     return path // (2 * CONTEXTS), path & 1
 
 
@@ -151,14 +151,14 @@ def test_garbage_leads_to_noise_and_text_out_of_it():
 
 
 def test_no_evidence_costs_nothing_and_is_no_word():
-    transitions = framed_transitions(CharacterFrame())
+    transitions = frame_layout(CharacterFrame())
     assert framed_path(transitions, np.zeros((60, CONTEXTS)))[1] == 0.0  # begins anywhere and runs on
     assert place_margin(transitions, np.zeros((60, CONTEXTS)), 30) == 0.0
 
 
 def test_place_margin_tells_text_that_fits_two_places():
     def margin(line, at):
-        return place_margin(framed_transitions(CharacterFrame()), likelihoods_of(line), at)
+        return place_margin(frame_layout(CharacterFrame()), likelihoods_of(line), at)
 
     # 0 1101101 1 11: begun three bits later it is 0 1101111 0 11, and so on for ever.
     assert margin(text_bits('m' * 20), 110) == 0.0
@@ -252,7 +252,7 @@ def test_free_bits_against_all_bits(seed, spread):
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.3, 3.0, 10.0, 30.0]), st.sampled_from(SHORT_FRAMES))
 def test_framed_path_against_all_bits_and_all_frames(seed, spread, frame):
     likelihoods = np.random.default_rng(seed).normal(0.0, spread, (BITS, CONTEXTS))
-    path, total = framed_path(framed_transitions(frame), likelihoods)
+    path, total = framed_path(frame_layout(frame), likelihoods)
     values = string_values(likelihoods)[:, None] - prices(frame)
     assert total == pytest.approx(values.max(), abs=1e-9)
     assert values[as_number(path & 1), path[-1] // (2 * CONTEXTS)] == pytest.approx(values.max(), abs=1e-9)
@@ -264,4 +264,4 @@ def test_place_margin_against_all_bits_and_all_frames(seed, spread, frame):
     likelihoods = np.random.default_rng(seed).normal(0.0, spread, (BITS, CONTEXTS))
     places = (string_values(likelihoods)[:, None] - prices(frame, 4)).max(axis=0)
     best, second = np.sort(places)[[-1, -2]]
-    assert place_margin(framed_transitions(frame), likelihoods, 4) == pytest.approx(best - second, abs=1e-9)
+    assert place_margin(frame_layout(frame), likelihoods, 4) == pytest.approx(best - second, abs=1e-9)

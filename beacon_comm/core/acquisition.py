@@ -23,10 +23,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from beacon_comm.core.bit_clock import EDGE_RUN, OFF, ON, BitClock, make_clock
-from beacon_comm.core.likelihood import CONTEXTS, COUNTS, LEVELS, MEMORY_BITS, SUB_SLOTS, learn, logarithms, weigh
-from beacon_comm.core.sequence_detection import SILENT_SHARE, Detection, make_detection
-from beacon_comm.core.trellis import Transitions, framed_path, free_bits, place_margin
+from beacon_comm.core.bit_clock import EDGE_RUN, OFF, ON, make_clock
+from beacon_comm.core.likelihood import COMPRESSION, CONTEXTS, COUNTS, LEVELS, MEMORY_BITS, SUB_SLOTS, learn, logarithms, weigh
+from beacon_comm.core.sequence_detection import SILENT_SHARE, make_detection
+from beacon_comm.core.trellis import PLACE, framed_path, free_bits, place_margin
 
 PHASES = 16
 """Phases of a bit at which the eye is measured."""
@@ -213,16 +213,16 @@ class Lock:
     """A beacon found: everything the locked receiver starts from.
 
     Attributes:
-        clock: at the window's first bit.
-        detection: with what was learnt.
+        clock: at the window's first bit, ``(1,)`` of ``CLOCK``.
+        detection: with what was learnt, ``(1,)`` of ``DETECTION``.
         inverted: the LED is on for 0.
         verdict: see :class:`Verdict`.
         period: of a bit (ns).
         positions: place in the frame of each bit of the window, ``(bits,)``; ``length`` and above: none.
     """
 
-    clock: BitClock
-    detection: Detection
+    clock: NDArray[np.void]
+    detection: NDArray[np.void]
     inverted: bool
     verdict: Verdict
     period: float
@@ -233,8 +233,7 @@ def acquire(
     t: NDArray[np.float64],
     polarity: NDArray[np.int8],
     periods: NDArray[np.float64],
-    transitions: Transitions,
-    compression: NDArray[np.uint8],
+    layout: NDArray[np.void],
     demands: Demands,
 ) -> Lock | None:
     """Look for a beacon in a window of events.
@@ -243,8 +242,7 @@ def acquire(
         t: event times (ns from an origin), ``(n,)`` float64, non-decreasing.
         polarity: ±1, ``(n,)`` int8.
         periods: periods (ns) to look at, ``(k,)``; the spacing finer than a quarter bit over the window.
-        transitions: framed trellis.
-        compression: table of compressed counts.
+        layout: of the character frame, ``(1,)`` of ``LAYOUT``.
         demands: what a lock has to show.
     """
     if len(t) < EDGE_RUN * demands.needed:
@@ -263,10 +261,10 @@ def acquire(
         if any(abs(period - other) * (stop - start) < SAME_BITS * period * other for other in read):
             continue
         read.append(period)
-        lock = _read(t, polarity, start, stop, period, transitions, compression, demands.needed)
+        lock = _read(t, polarity, start, stop, period, layout, demands.needed)
         if lock is not None and abs(lock.verdict.slope) > LEAST_SLOPE:
             period = _settled(t, polarity, start, lock.period * (1.0 + lock.verdict.slope))
-            other = _read(t, polarity, start, stop, period, transitions, compression, demands.needed)
+            other = _read(t, polarity, start, stop, period, layout, demands.needed)
             if other is not None and other.verdict.spread < lock.verdict.spread:
                 lock = other
         if lock is None or not nearest <= lock.period <= farthest:
@@ -282,38 +280,38 @@ def _read(
     start: float,
     stop: float,
     period: float,
-    transitions: Transitions,
-    compression: NDArray[np.uint8],
+    layout: NDArray[np.void],
     needed: int,
 ) -> Lock | None:
+    length = int(layout['length'][0])
     border = start + (_phase(_eye(_fine(t, polarity, start, period, stop))) - 1.0) * period
     bits = int((stop - border) / period) + 1
     raw = _counts(t, polarity, border, period, bits)
     gain = max(1.0, raw.sum() / bits / REFERENCE_EVENTS)
-    counts = compression[np.minimum((raw / gain + 0.5).astype(np.int64), len(compression) - 1)]
+    counts = COMPRESSION[np.minimum((raw / gain + 0.5).astype(np.int64), len(COMPRESSION) - 1)]
     likelihoods, free = _learn_free(raw, counts)
     inverted, path, likelihood = False, None, -np.inf
     for turned in (False, True):
-        if _may_convince(free ^ turned, transitions):
-            other, its_likelihood = framed_path(transitions, likelihoods[:, ::-1].copy() if turned else likelihoods)
+        if _may_convince(free ^ turned, layout):
+            other, its_likelihood = framed_path(layout, likelihoods[:, ::-1].copy() if turned else likelihoods)
             if its_likelihood > likelihood:
                 inverted, path, likelihood = turned, other, its_likelihood
     if path is None:
         return None
     cost = _log_likelihood(likelihoods, free) - likelihood
     free = free ^ inverted
-    passing, failing, _ = _judge(path, free, transitions.length)
+    passing, failing, _ = _judge(path, free, length)
     hopeful = passing >= needed and failing <= HOPEFUL * passing
     if not hopeful and (passing + failing < needed or cost > CHEAP_COST * (passing + failing)):
         return None  # to learn from the path would cost as much again
-    histograms, likelihoods, path = _learn_framed(counts, path, transitions, inverted)
-    passing, failing, changes = _judge(path, free, transitions.length)
-    covered = passing * transitions.length
-    framed = np.flatnonzero(path // (2 * CONTEXTS) < transitions.length)
+    histograms, likelihoods, path = _learn_framed(counts, path, layout, inverted)
+    passing, failing, changes = _judge(path, free, length)
+    covered = passing * length
+    framed = np.flatnonzero(path // PLACE < length)
     middle = int(framed[len(framed) // 2]) if len(framed) else 0
-    margin = place_margin(transitions, likelihoods, middle)
+    margin = place_margin(layout, likelihoods, middle)
     latencies = np.empty(2)
-    edges = _locate_edges(t, polarity, border, period, path, transitions.length, inverted, latencies)
+    edges = _locate_edges(t, polarity, border, period, path, length, inverted, latencies)
     verdict = Verdict(
         passing,
         failing,
@@ -336,9 +334,9 @@ def _read(
     period *= 1.0 + edges.stretch
     clock = make_clock(border, period, latencies * period, edges.spread, verdict.period_std)
     detection = make_detection(
-        histograms, means, gain, silence, verdict.fit, _empty_share(raw, path), verdict.passing, compression, transitions.states
+        histograms, means, gain, silence, verdict.fit, _empty_share(raw, path), verdict.passing
     )
-    return Lock(clock, detection, inverted, verdict, period, path // (2 * CONTEXTS))
+    return Lock(clock, detection, inverted, verdict, period, path // PLACE)
 
 
 @njit(cache=True, nogil=True)
@@ -473,7 +471,7 @@ def _locate_edges(t, polarity, border, period, path, length, inverted, latencies
     count, word, first = 0, 0, 0
     sign = -1 if inverted else 1
     for n in range(1, len(path)):
-        place = path[n] // (2 * CONTEXTS)
+        place = path[n] // PLACE
         word += place == 0
         if place >= length or (path[n] & 1) == (path[n - 1] & 1):
             continue
@@ -592,7 +590,7 @@ def _log_likelihood(likelihoods, bits):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _learn_framed(counts, path, transitions, inverted):  # type: ignore[no-untyped-def]
+def _learn_framed(counts, path, layouts, inverted):  # type: ignore[no-untyped-def]
     """Learn on, from a framed path; return histograms (of the bits, not of their complement), log p and path."""
     tables = np.empty((CONTEXTS, COUNTS, LEVELS))
     histograms = np.empty((CONTEXTS, COUNTS, LEVELS))
@@ -603,18 +601,18 @@ def _learn_framed(counts, path, transitions, inverted):  # type: ignore[no-untyp
         likelihoods = _weigh_all(tables, counts)
         if inverted:
             likelihoods = likelihoods[:, ::-1].copy()
-        path, _ = framed_path(transitions, likelihoods)
+        path, _ = framed_path(layouts, likelihoods)
     return histograms, likelihoods, path
 
 
 @njit(cache=True, nogil=True)
-def _may_convince(free, transitions):  # type: ignore[no-untyped-def]
+def _may_convince(free, layouts):  # type: ignore[no-untyped-def]
     """Return whether any path could have few enough failing words: reading a path costs far more than this.
 
     The best path takes words that the free bits confirm, and pays for the zeros beside them; the window may begin and end
     within a word.
     """
-    length, words = transitions.length, transitions.words
+    length, words = layouts[0].length, layouts[0].words
     mask = (1 << length) - 1
     most_failing = LONG_FAILING if len(free) >= LONG_WORDS * length else CHEAP_FAILING
     merit = np.zeros(len(free) + 1)
@@ -636,7 +634,7 @@ def _judge(path, free, length):  # type: ignore[no-untyped-def]
     """
     passing, failing, noise, changes = 0, 0, 0, 0
     for n in range(len(path)):
-        position = path[n] // (2 * CONTEXTS)
+        position = path[n] // PLACE
         if position == length:
             noise += free[n] == 0
         elif position == length + 1:

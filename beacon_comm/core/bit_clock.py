@@ -18,7 +18,6 @@ While frames are not confirmed the filter only predicts: noise must not walk the
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -68,44 +67,55 @@ MOST_PERIOD_ERROR = 0.003
 MOST_PHASE_ERROR = 0.3
 """What is known of period (share) and phase (bit) is never taken for worse."""
 
-# Values of the clock: times in ns from the demodulator's origin; SHIFT and STRETCH are what the edge located at the end
-# of the present bit says.
-BORDER, PERIOD, VARIANCE, P_PHASE, P_CROSS, P_PERIOD = range(6)
-FIRST_PERIOD, SHIFT, STRETCH, BIAS, RUN_SINCE = range(6, 11)
-
 OFF, ON = range(2)
 """Kinds of edges, places in the latencies."""
 
+CLOCK = np.dtype(
+    [
+        ('border', np.float64),
+        ('period', np.float64),
+        ('variance', np.float64),
+        ('p_phase', np.float64),
+        ('p_cross', np.float64),
+        ('p_period', np.float64),
+        ('first_period', np.float64),
+        ('shift', np.float64),
+        ('stretch', np.float64),
+        ('bias', np.float64),
+        ('run_since', np.float64),
+        ('run', np.int64),
+        ('frozen', np.bool_),
+        ('latencies', np.float64, (2,)),
+        ('counts', np.int64, (COUNTS,)),
+        ('signed', np.int64, (EDGE_LAG + 2, FINE)),
+        ('events', np.int64, (EDGE_LAG + 2,)),
+        ('shifts', np.float64, (EDGE_LAG + 2,)),
+    ],
+    align=True,
+)
+"""State of the clock and of the bit that is being counted; times in ns from the demodulator's origin.
 
-class BitClock(NamedTuple):
-    """State of the clock and of the bit that is being counted.
-
-    Attributes:
-        values: see the constants above, ``(11,)`` float64.
-        latencies: of the edges to OFF and to ON behind the borders (ns), ``(2,)`` float64.
-        frozen: whether it only predicts, ``(1,)`` bool.
-        counts: events of the present bit, ``(COUNTS,)`` int64.
-        signed: signed events of the present bit (the last row) and of those before it in their bins,
-            ``(EDGE_LAG + 2, FINE)`` int64.
-        events: all events of these bits, ``(EDGE_LAG + 2,)`` int64.
-        shifts: by how much the border of each of these bits was corrected (ns), ``(EDGE_LAG + 2,)`` float64.
-        run: OFF events in a row, counted while the phase is unsure, ``(1,)`` int64.
-    """
-
-    values: NDArray[np.float64]
-    latencies: NDArray[np.float64]
-    frozen: NDArray[np.bool_]
-    counts: NDArray[np.int64]
-    signed: NDArray[np.int64]
-    events: NDArray[np.int64]
-    shifts: NDArray[np.float64]
-    run: NDArray[np.int64]
+Fields:
+    border, period: where the present bit begins, and its length (ns).
+    variance: of the edges' residuals (bit²).
+    p_phase, p_cross, p_period: covariance of phase (bit) and period (share).
+    first_period: at lock (ns).
+    shift, stretch: what the edge located at the end of the present bit says about border (ns) and period (share).
+    bias: running mean of the residuals (standard deviations).
+    run, run_since: OFF events in a row, counted while the phase is unsure, and the time of the first (ns).
+    frozen: whether the clock only predicts.
+    latencies: of the edges to OFF and to ON behind the borders (ns).
+    counts: events of the present bit.
+    signed: signed events of the present bit (the last row) and of those before it in their bins.
+    events: all events of these bits.
+    shifts: by how much the border of each of these bits was corrected (ns).
+"""
 
 
 def make_clock(
     border: float, period: float, latencies: NDArray[np.float64], spread: float, period_error: float
-) -> BitClock:
-    """Return a clock.
+) -> NDArray[np.void]:
+    """Return a clock, one record ``(1,)`` of ``CLOCK``.
 
     Args:
         border: where a bit begins (ns from the origin).
@@ -114,22 +124,13 @@ def make_clock(
         spread: standard deviation of an edge's residual (bit).
         period_error: standard deviation of the period (share of it).
     """
-    values = np.zeros(11)
-    values[[BORDER, PERIOD, FIRST_PERIOD]] = border, period, period
-    values[VARIANCE] = max(spread, LEAST_RESIDUAL) ** 2
-    values[P_PHASE] = 0.05**2
-    values[P_PERIOD] = period_error**2
-    rows = EDGE_LAG + 2
-    return BitClock(
-        values,
-        latencies.astype(np.float64),
-        np.zeros(1, np.bool_),
-        np.zeros(COUNTS, np.int64),
-        np.zeros((rows, FINE), np.int64),
-        np.zeros(rows, np.int64),
-        np.zeros(rows),
-        np.zeros(1, np.int64),
-    )
+    clock = np.zeros(1, CLOCK)
+    clock['border'], clock['period'], clock['first_period'] = border, period, period
+    clock['variance'] = max(spread, LEAST_RESIDUAL) ** 2
+    clock['p_phase'] = 0.05**2
+    clock['p_period'] = period_error**2
+    clock['latencies'] = latencies
+    return clock
 
 
 @njit(cache=True, nogil=True)
@@ -145,12 +146,12 @@ def take_events(clock, t, polarity, first, sign, settled):  # type: ignore[no-un
     Returns:
         index of the first event behind the bit.
     """
-    values, counts, signed = clock.values, clock.counts, clock.signed[-1]
-    border, per_bin = values[BORDER], FINE / values[PERIOD]
-    stop = border + values[PERIOD]
+    counts, signed = clock.counts, clock.signed[-1]
+    border, per_bin = clock.border, FINE / clock.period
+    stop = border + clock.period
     unsure = settled and _unsure(clock)
     if not unsure:
-        clock.run[0] = 0
+        clock.run = 0
     i = first
     while i < len(t):
         at = t[i]
@@ -159,8 +160,8 @@ def take_events(clock, t, polarity, first, sign, settled):  # type: ignore[no-un
         here = sign * polarity[i]
         if unsure and _falls(clock, at, here):
             unsure = _unsure(clock)
-            border = values[BORDER]
-            stop = border + values[PERIOD]
+            border = clock.border
+            stop = border + clock.period
         place = min(max(int((at - border) * per_bin), 0), FINE - 1)
         slot = place // (FINE // SUB_SLOTS)
         counts[slot if here > 0 else SUB_SLOTS + slot] += 1
@@ -172,29 +173,28 @@ def take_events(clock, t, polarity, first, sign, settled):  # type: ignore[no-un
 
 @njit(cache=True, nogil=True)
 def _unsure(clock):  # type: ignore[no-untyped-def]
-    return clock.values[P_PHASE] > UNSURE_PHASE * UNSURE_PHASE and not clock.frozen[0]
+    return clock.p_phase > UNSURE_PHASE * UNSURE_PHASE and not clock.frozen
 
 
 @njit(cache=True, nogil=True)
 def _falls(clock, at, polarity):  # type: ignore[no-untyped-def]
     """Take an event after a long idle line; return whether it is the ``EDGE_RUN``th of a fall, which sets the phase."""
-    values, run = clock.values, clock.run
     if polarity > 0:
-        run[0] = 0
+        clock.run = 0
         return False
-    if run[0] == 0:
-        values[RUN_SINCE] = at
-    run[0] += 1
-    if run[0] < EDGE_RUN:
+    if clock.run == 0:
+        clock.run_since = at
+    clock.run += 1
+    if clock.run < EDGE_RUN:
         return False
-    run[0] = 0
+    clock.run = 0
     usual = 0.5 * (clock.events[:-1].sum() - clock.signed[:-1].sum()) + 1.0
-    if (at - values[RUN_SINCE]) * usual > SUDDEN * (EDGE_LAG + 1) * values[PERIOD]:
+    if (at - clock.run_since) * usual > SUDDEN * (EDGE_LAG + 1) * clock.period:
         return False
-    off = (values[RUN_SINCE] - clock.latencies[OFF] - values[BORDER]) / values[PERIOD]
-    _follow(values, clock.latencies, OFF, off - math.floor(off + 0.5))
-    values[BORDER] += values[SHIFT]
-    values[SHIFT] = 0.0
+    off = (clock.run_since - clock.latencies[OFF] - clock.border) / clock.period
+    _follow(clock, OFF, off - math.floor(off + 0.5))
+    clock.border += clock.shift
+    clock.shift = 0.0
     clock.signed[-1] = 0  # on the old grid: this edge has been seen
     return True
 
@@ -207,10 +207,9 @@ def see_edge(clock, to):  # type: ignore[no-untyped-def]
         clock: with all events of the present bit; changed in place.
         to: ``ON`` where the bits change to 1, else ``OFF``.
     """
-    if clock.frozen[0]:
+    if clock.frozen:
         return
-    values = clock.values
-    late = clock.latencies[to] / values[PERIOD]
+    late = clock.latencies[to] / clock.period
     begin = max(FINE + int(round((late - GATE) * FINE)), 0)
     stop = min(FINE + int(round((late + GATE) * FINE)), (EDGE_LAG + 2) * FINE)
     up = 1 if to == ON else -1
@@ -233,36 +232,35 @@ def see_edge(clock, to):  # type: ignore[no-untyped-def]
     since = 0.0  # how much the borders behind the edge have been corrected
     for row in range(max(at // FINE, 1) + 1, EDGE_LAG + 2):
         since += clock.shifts[row]
-    residual = (at + 0.5) / FINE - 1.0 - late - since / values[PERIOD]
-    deviations = residual / math.sqrt(values[P_PHASE] + values[VARIANCE])
+    residual = (at + 0.5) / FINE - 1.0 - late - since / clock.period
+    deviations = residual / math.sqrt(clock.p_phase + clock.variance)
     bounded = min(max(deviations, -OUTLIER_DEVIATIONS), OUTLIER_DEVIATIONS)
-    values[BIAS] += BIAS_GAIN * (bounded - values[BIAS])
+    clock.bias += BIAS_GAIN * (bounded - clock.bias)
     if bounded == deviations:
-        _follow(values, clock.latencies, to, residual)
+        _follow(clock, to, residual)
 
 
 @njit(cache=True, nogil=True)
-def _follow(values, latencies, to, residual):  # type: ignore[no-untyped-def]
+def _follow(clock, to, residual):  # type: ignore[no-untyped-def]
     """Correct phase and period by what an edge to OFF or to ON lies off (bit)."""
-    variance = values[VARIANCE]
-    innovation = values[P_PHASE] + variance
-    gain, gain_period = values[P_PHASE] / innovation, values[P_CROSS] / innovation
-    values[SHIFT] += gain * residual * values[PERIOD]
-    values[STRETCH] += gain_period * residual
-    values[P_PERIOD] -= gain_period * values[P_CROSS]
-    values[P_CROSS] *= 1.0 - gain
-    values[P_PHASE] *= 1.0 - gain
-    values[VARIANCE] = max(variance + 0.02 * (residual * residual - variance), LEAST_RESIDUAL * LEAST_RESIDUAL)
-    share = 0.5 * LATENCY_GAIN * residual * values[PERIOD]
-    latencies[to] += share
-    latencies[1 - to] -= share  # their mean is the phase
+    variance = clock.variance
+    innovation = clock.p_phase + variance
+    gain, gain_period = clock.p_phase / innovation, clock.p_cross / innovation
+    clock.shift += gain * residual * clock.period
+    clock.stretch += gain_period * residual
+    clock.p_period -= gain_period * clock.p_cross
+    clock.p_cross *= 1.0 - gain
+    clock.p_phase *= 1.0 - gain
+    clock.variance = max(variance + 0.02 * (residual * residual - variance), LEAST_RESIDUAL * LEAST_RESIDUAL)
+    share = 0.5 * LATENCY_GAIN * residual * clock.period
+    clock.latencies[to] += share
+    clock.latencies[1 - to] -= share  # their mean is the phase
 
 
 @njit(cache=True, nogil=True)
 def go_on(clock, bits):  # type: ignore[no-untyped-def]
     """Go on by some bits: predict, and begin to count anew; ``clock`` is changed in place."""
-    values = clock.values
-    agile = AGILE_NOISE * max(abs(values[BIAS]) - MOST_BIAS, 0.0) if clock.events[-1] else 0.0
+    agile = AGILE_NOISE * max(abs(clock.bias) - MOST_BIAS, 0.0) if clock.events[-1] else 0.0
     for row in range(EDGE_LAG + 1):
         clock.signed[row] = clock.signed[row + 1]
         clock.events[row] = clock.events[row + 1]
@@ -270,17 +268,17 @@ def go_on(clock, bits):  # type: ignore[no-untyped-def]
     clock.counts[:] = 0
     clock.signed[-1] = 0
     clock.events[-1] = 0
-    clock.shifts[-1] = values[SHIFT]
-    values[BORDER] += values[SHIFT] + bits * values[PERIOD]
-    period = values[PERIOD] * (1.0 + values[STRETCH])
-    values[PERIOD] = min(max(period, values[FIRST_PERIOD] * (1.0 - PULL)), values[FIRST_PERIOD] * (1.0 + PULL))
-    values[SHIFT], values[STRETCH] = 0.0, 0.0
-    values[P_PHASE] += bits * (2.0 * values[P_CROSS] + bits * values[P_PERIOD] + PHASE_NOISE * PHASE_NOISE)
-    values[P_CROSS] += bits * values[P_PERIOD]
-    values[P_PERIOD] += bits * (PERIOD_NOISE * PERIOD_NOISE + agile * agile)
-    if values[P_PERIOD] > MOST_PERIOD_ERROR * MOST_PERIOD_ERROR:
-        values[P_CROSS] *= MOST_PERIOD_ERROR / math.sqrt(values[P_PERIOD])
-        values[P_PERIOD] = MOST_PERIOD_ERROR * MOST_PERIOD_ERROR
-    if values[P_PHASE] > MOST_PHASE_ERROR * MOST_PHASE_ERROR:
-        values[P_CROSS] *= MOST_PHASE_ERROR / math.sqrt(values[P_PHASE])
-        values[P_PHASE] = MOST_PHASE_ERROR * MOST_PHASE_ERROR
+    clock.shifts[-1] = clock.shift
+    clock.border += clock.shift + bits * clock.period
+    period = clock.period * (1.0 + clock.stretch)
+    clock.period = min(max(period, clock.first_period * (1.0 - PULL)), clock.first_period * (1.0 + PULL))
+    clock.shift, clock.stretch = 0.0, 0.0
+    clock.p_phase += bits * (2.0 * clock.p_cross + bits * clock.p_period + PHASE_NOISE * PHASE_NOISE)
+    clock.p_cross += bits * clock.p_period
+    clock.p_period += bits * (PERIOD_NOISE * PERIOD_NOISE + agile * agile)
+    if clock.p_period > MOST_PERIOD_ERROR * MOST_PERIOD_ERROR:
+        clock.p_cross *= MOST_PERIOD_ERROR / math.sqrt(clock.p_period)
+        clock.p_period = MOST_PERIOD_ERROR * MOST_PERIOD_ERROR
+    if clock.p_phase > MOST_PHASE_ERROR * MOST_PHASE_ERROR:
+        clock.p_cross *= MOST_PHASE_ERROR / math.sqrt(clock.p_phase)
+        clock.p_phase = MOST_PHASE_ERROR * MOST_PHASE_ERROR

@@ -8,7 +8,7 @@ A bit is cut into 4 *sub-slots*; the ON and the OFF events in each are counted, 
     OFF events  │  0  0   0   1 │ 3  17  14   8 │      1.5 to 2 bits: the counts depend on the bits before, too
 
 The *context* of a bit is the last 3 bits, its own included.  log p(counts | context) is the sum over the 8 counts of
-log p(count | context), each from a histogram of compressed counts (:func:`compress`) with *back-off*: where a context
+log p(count | context), each from a histogram of compressed counts (``COMPRESSION``) with *back-off*: where a context
 was seen rarely its histogram leans on that of the last 2 bits, this on that of the last bit, this on all bits'.
 
 The histograms are learnt blind: nobody tells the bits, they are the receiver's own earlier decisions.
@@ -38,10 +38,13 @@ FLOOR = 2e-3
 """Share of an even spread over all counts in every histogram: no count is impossible."""
 
 
-def compression_table(most: int = 1024) -> NDArray[np.uint8]:
-    """Return the compressed value of the counts 0 to ``most - 1``, ``(most,)`` uint8."""
+def _compression_table(most: int = 1024) -> NDArray[np.uint8]:
     n = np.arange(most)
     return np.minimum(np.where(n < 4, n, np.floor(2.0 * np.sqrt(n))), LEVELS - 1).astype(np.uint8)
+
+
+COMPRESSION = _compression_table()
+"""The compressed value of a count; greater counts are taken for the last one."""
 
 
 @njit(cache=True, nogil=True)

@@ -19,12 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beacon_comm.core.acquisition import Demands, Lock, acquire
-from beacon_comm.core.bit_clock import BORDER, P_CROSS, P_PERIOD, P_PHASE, PERIOD
 from beacon_comm.core.character import Character, Status
 from beacon_comm.core.event_buffer import EVENT_BYTES, EventArrays
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.framing import CharacterFrame
-from beacon_comm.core.likelihood import MEMORY_BITS, compression_table
+from beacon_comm.core.likelihood import MEMORY_BITS
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.rate_search import RateSearch, make_searches
 from beacon_comm.core.search_budget import SearchBudget
@@ -50,8 +49,8 @@ from beacon_comm.core.sequence_detection import (
     silent_since,
     start_at,
 )
-from beacon_comm.core.soft_decision import confidence_of, frame_layout
-from beacon_comm.core.trellis import framed_transitions
+from beacon_comm.core.soft_decision import confidence_of
+from beacon_comm.core.trellis import frame_layout
 
 ADJACENT_BITS = 15
 """The character before the one from which on a lock is trusted is given out, too, if no more bits lie between their starts."""
@@ -79,10 +78,8 @@ class SequenceDemodulator:
 
     def __init__(self, parameters: Parameters) -> None:
         self._frame = CharacterFrame.from_parameters(parameters)
-        self._transitions = framed_transitions(self._frame)
         self._layout = frame_layout(self._frame)
         self._decode = self._frame.decoding_table()
-        self._compression = compression_table()
         self._searches: list[RateSearch] = make_searches(parameters, self._frame)
         self._longest = max(search.longest for search in self._searches)
         self._most_events = parameters.buffer_max_bytes // EVENT_BYTES
@@ -119,7 +116,7 @@ class SequenceDemodulator:
     def bit_rate_bps(self) -> float | None:
         """The bit rate of the present lock, or of the one at the stream's end (bit/s), None without one."""
         lock = self._lock or self._ended
-        return None if lock is None else NS_PER_S / float(lock.clock.values[PERIOD])
+        return None if lock is None else NS_PER_S / float(lock.clock['period'][0])
 
     @property
     def bit_rate_std_bps(self) -> float | None:
@@ -127,8 +124,8 @@ class SequenceDemodulator:
         lock = self._lock or self._ended
         if lock is None:
             return None
-        values = lock.clock.values
-        return math.sqrt(float(values[P_PERIOD])) * NS_PER_S / float(values[PERIOD])
+        clock = lock.clock[0]
+        return math.sqrt(float(clock['p_period'])) * NS_PER_S / float(clock['period'])
 
     @property
     def given_up(self) -> bool:
@@ -201,7 +198,7 @@ class SequenceDemodulator:
                 break
             if status != FULL:
                 self._unlock(reread=status == LOST)
-        count = end_detection(lock.clock, lock.detection, self._transitions, self._layout, self._rows)
+        count = end_detection(lock.clock, lock.detection, self._layout, self._rows)
         characters += self._characters(self._rows[:count])
         self._unlock(reread=True)
         self._ended = lock
@@ -218,7 +215,6 @@ class SequenceDemodulator:
         count, taken, status = detect(
             lock.clock,
             lock.detection,
-            self._transitions,
             self._layout,
             lock.inverted,
             self._t[self._taken : stop],
@@ -236,7 +232,7 @@ class SequenceDemodulator:
 
     def _refine(self, lock: Lock, stop: int) -> None:
         """Learn phase and histograms anew from what came since the lock, and go on from the last character."""
-        period = float(lock.clock.values[PERIOD])
+        period = float(lock.clock['period'][0])
         first = int(np.searchsorted(self._t, self._refine_at - REFINED_AFTER * self._frame.length * period))
         self._refine_at = math.inf
         window = slice(first, stop)
@@ -244,8 +240,7 @@ class SequenceDemodulator:
             self._t[window],
             self._polarity[window],
             period * REFINED_PERIODS,
-            self._transitions,
-            self._compression,
+            self._layout,
             REFINED_DEMANDS,
         )
         if better is not None and better.inverted == lock.inverted:
@@ -253,7 +248,7 @@ class SequenceDemodulator:
 
     def _unlock(self, *, reread: bool) -> None:
         assert self._lock is not None
-        lost_at = float(self._lock.clock.values[BORDER])
+        lost_at = float(self._lock.clock['border'][0])
         # What is lost in what was said before it was found would be found and lost there for ever.
         reread &= lost_at >= self._found_at
         self._usable_from = max(self._given_to, lost_at - self._reread(self._lock) if reread else lost_at)
@@ -357,8 +352,7 @@ class SequenceDemodulator:
             self._t[window],
             self._polarity[window],
             periods,
-            self._transitions,
-            self._compression,
+            self._layout,
             search.demands,
         )
 
@@ -380,7 +374,7 @@ class SequenceDemodulator:
 
     def _start(self, lock: Lock, first: int, now: float) -> None:
         """Follow a lock that was found at the time ``now`` (ns) from the buffer's beginning on."""
-        border = float(lock.clock.values[BORDER])
+        border = float(lock.clock['border'][0])
         self._trusted = False
         self._pending = None
         self._read_to = self._given_to
@@ -395,12 +389,12 @@ class SequenceDemodulator:
     def _begin(self, lock: Lock, t: float) -> None:
         """Follow a lock from about the time ``t`` (ns) on."""
         length = self._frame.length
-        values = lock.clock.values
-        bits = math.floor((t - values[BORDER]) / lock.period) - (MEMORY_BITS - 1)
-        values[BORDER] += bits * lock.period
+        clock = lock.clock[0]
+        bits = math.floor((t - clock['border']) / lock.period) - (MEMORY_BITS - 1)
+        clock['border'] += bits * lock.period
         since_middle = bits - 0.5 * len(lock.positions)  # of the window, where the phase is known best
-        values[P_PHASE] += since_middle * since_middle * values[P_PERIOD]
-        values[P_CROSS] += since_middle * values[P_PERIOD]
+        clock['p_phase'] += since_middle * since_middle * clock['p_period']
+        clock['p_cross'] += since_middle * clock['p_period']
         positions = lock.positions
         at = min(max(bits, 0), len(positions) - 1)
         framed = np.flatnonzero(positions[at:] < length)
@@ -425,7 +419,7 @@ class SequenceDemodulator:
             first = max(int(np.searchsorted(self._t, needed_from)), len(self._t) - self._most_events)
         if len(self._gaps):
             if self._lock is not None:  # how the next event is taken depends on whether the silence was one
-                needed_from = min(needed_from, silent_since(self._lock.clock, self._lock.detection))
+                needed_from = min(needed_from, silent_since(self._lock.clock[0], self._lock.detection[0]))
             self._gaps = self._gaps[self._gaps[:, 1] > needed_from]
         self._events.drop(first)
         self._taken -= first

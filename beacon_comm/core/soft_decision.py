@@ -13,40 +13,12 @@ have failed: noise is as good without a frame as with one.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.likelihood import CONTEXTS, MEMORY_BITS
 from beacon_comm.core.trellis import UNLIKELY
-
-
-class FrameLayout(NamedTuple):
-    """The frame as numbers for the kernels.
-
-    Attributes:
-        fixed: forced bit of each position, -1 where it is free, ``(length,)`` int8.
-        parity: 0 even, 1 odd, -1 none.
-        checked: whether a position is under the parity (data bits and parity bit), ``(length,)`` bool.
-    """
-
-    fixed: NDArray[np.int8]
-    parity: int
-    checked: NDArray[np.bool_]
-
-
-def frame_layout(frame: CharacterFrame) -> FrameLayout:
-    """Return a character frame's layout."""
-    fixed = np.full(frame.length, -1, np.int8)
-    fixed[0] = 0
-    fixed[frame.length - frame.stop_bits :] = 1
-    checked = np.zeros(frame.length, np.bool_)
-    if frame.parity_bits:
-        checked[1 : frame.length - frame.stop_bits] = True
-    return FrameLayout(fixed, {'even': 0, 'odd': 1, 'none': -1}[frame.parity], checked)
 
 
 @njit(cache=True, nogil=True)
@@ -98,9 +70,9 @@ def margins(likelihoods, before, after, word, layout):  # type: ignore[no-untype
     Args:
         likelihoods, before, after: see :func:`bit_ratios`.
         word: the decided bits, first one most significant.
-        layout: the frame's.
+        layout: a record of ``LAYOUT``.
     """
-    length = len(layout.fixed)
+    length = layout.length
     # best[v, p, c]: best path so far that is not the word's own, by violation, parity and context
     best = np.full((2, 2, CONTEXTS), UNLIKELY)
     fresh = np.empty((2, 2, CONTEXTS))

@@ -17,7 +17,7 @@ light or an unknown sender leads, so that no character has to be read into them.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
+from itertools import product
 
 import numpy as np
 from numba import njit
@@ -42,88 +42,76 @@ NOISE_STAY_COST = 1.0
 NOISE_EXIT_COST = 2.0
 """Price of finding back into a frame (nat)."""
 
+UNLIKELY = -1e30
+"""Metric of a state that nothing leads to (nat): what is added to it is lost in rounding."""
 
-class Transitions(NamedTuple):
-    """All transitions of the framed trellis but those into noise, sorted by where they lead.
+MOST_BITS = 12
+"""The longest frame: a start bit, 8 data bits, a parity bit and 2 stop bits."""
 
-    A state is ``(position · 2 + parity) · CONTEXTS + context``; the position is that of the state's own bit, with
-    ``length`` for idle and ``length + 1`` for noise.  Noise can be entered from everywhere, for ``NOISE_COST``: of the states
-    of one context the best does it.
+PLACE = 2 * CONTEXTS
+"""States of one place in the frame: both parities, all contexts."""
 
-    Attributes:
-        source, target: states, ``(n,)`` int32.
-        cost: price (nat), ``(n,)`` float64.
-        states: number of states.
-        length: bits of a frame.
-        words: whether that many bits, the first one most significant, are a frame, ``(2**length,)`` bool.
-    """
+STATES = (MOST_BITS + 2) * PLACE + CONTEXTS
+"""Room for the states of any frame, and behind them for one block of contexts that nothing leads to."""
 
-    source: NDArray[np.int32]
-    target: NDArray[np.int32]
-    cost: NDArray[np.float64]
-    states: int
-    length: int
-    words: NDArray[np.bool_]
+LAYOUT = np.dtype(
+    [
+        ('length', np.int64),
+        ('states', np.int64),
+        ('before', np.uint8, (STATES,)),
+        ('words', np.uint8, (1 << MOST_BITS,)),
+        ('fixed', np.int8, (MOST_BITS,)),
+        ('parity', np.int64),
+        ('checked', np.uint8, (MOST_BITS,)),
+    ],
+    align=True,
+)
+"""A character frame as numbers for the kernels.
+
+A state of the framed trellis is ``(place · 2 + parity) · CONTEXTS + context``; the place is that of the state's own bit,
+with ``length`` for idle and ``length + 1`` for noise.
+
+Fields:
+    length: bits of a frame.
+    states: number of states.
+    before: the lower one of the two states that lead to a state within the frame; the other is ``CONTEXTS // 2`` above.
+    words: whether that many bits, the first one most significant, are a frame.
+    fixed: forced bit of each place, -1 where it is free.
+    parity: 0 even, 1 odd, -1 none.
+    checked: whether a place is under the parity (data bits and parity bit).
+"""
 
 
 @lru_cache(maxsize=16)
-def framed_transitions(frame: CharacterFrame) -> Transitions:
-    """Return the framed trellis of a character frame; computed once for equal layouts, nobody writes to it."""
-    length = frame.length
-    idle, noise = length, length + 1
+def frame_layout(frame: CharacterFrame) -> NDArray[np.void]:
+    """Return a character frame's layout, ``(1,)`` of ``LAYOUT``; computed once for equal frames, nobody writes to it."""
+    layouts = np.zeros(1, LAYOUT)
+    layout, length, first_stop = layouts[0], frame.length, frame.length - frame.stop_bits
+    layout['length'], layout['states'] = length, (length + 2) * PLACE
+    layout['words'][: 1 << length] = [status is Status.OK for _, status in frame.decoding_table()]
+    layout['fixed'] = -1
+    layout['fixed'][0] = 0
+    layout['fixed'][first_stop:length] = 1
+    layout['parity'] = {'even': 0, 'odd': 1, 'none': -1}[frame.parity]
+    layout['checked'][1:first_stop] = frame.parity_bits
+    layout['before'] = layout['states']
     parity_at = 1 + frame.data_bits if frame.parity_bits else -1
-    first_stop = length - frame.stop_bits
-    found: list[tuple[int, int, float]] = []
-
-    def state(position: int, parity: int, context: int) -> int:
-        return (position * 2 + parity) * CONTEXTS + context
-
-    def add(source: int, position: int, parity: int, context: int, bit: int, cost: float) -> None:
-        found.append((state(position, parity, (context << 1 | bit) & (CONTEXTS - 1)), source, cost))
-
-    def add_within(source: int, position: int, parity: int, context: int) -> None:
-        """Add what may follow inside a frame: ``position`` is the next bit's."""
-        for bit in (0, 1):
-            if position >= first_stop:
-                if bit == 1:
-                    add(source, position, 0, context, bit, 0.0)
-            elif position == parity_at:
-                if bit == parity ^ (frame.parity == 'odd'):
-                    add(source, position, 0, context, bit, 0.0)
-            else:
-                after = parity ^ bit if frame.parity_bits else 0
-                add(source, position, after, context, bit, 0.0)
-
-    for context in range(CONTEXTS):
-        for position in range(length):
-            for parity in (0, 1) if 0 < position < first_stop else (0,):
-                here = state(position, parity, context)
-                if position == length - 1:
-                    add(here, 0, 0, context, 0, 0.0)
-                    add(here, idle, 0, context, 1, IDLE_COST)
-                else:
-                    add_within(here, position + 1, parity, context)
-        here = state(idle, 0, context)
-        add(here, idle, 0, context, 1, IDLE_STAY_COST)
-        add(here, 0, 0, context, 0, IDLE_STAY_COST)
-        here = state(noise, 0, context)
-        for bit in (0, 1):
-            add(here, noise, 0, context, bit, NOISE_STAY_COST)
-        add(here, 0, 0, context, 0, NOISE_EXIT_COST)
-        add(here, idle, 0, context, 1, NOISE_EXIT_COST)
-    found.sort()
-    target, source, cost = zip(*found, strict=True)
-    return Transitions(
-        np.array(source, np.int32),
-        np.array(target, np.int32),
-        np.array(cost, np.float64),
-        (length + 2) * 2 * CONTEXTS,
-        length,
-        np.array([status is Status.OK for _, status in frame.decoding_table()]),
-    )
-
-
-UNLIKELY = -1e30
+    for place, parity, context in product(range(1, length), (0, 1), range(CONTEXTS)):
+        bit, parity_before = context & 1, 0
+        if place >= first_stop:
+            reached = bit == 1 and parity == 0
+        elif place == parity_at:
+            reached, parity_before = parity == 0, bit ^ (frame.parity == 'odd')
+        elif frame.parity_bits:
+            parity_before = parity ^ bit
+            reached = place > 1 or parity_before == 0
+        else:
+            reached = parity == 0
+        if reached:
+            layout['before'][place * PLACE + parity * CONTEXTS + context] = (
+                (place - 1) * PLACE + parity_before * CONTEXTS + (context >> 1)
+            )
+    return layouts
 
 
 @njit(cache=True, nogil=True)
@@ -142,35 +130,87 @@ def free_step(metric, best, likelihoods):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def framed_step(source, target, cost, metric, fresh, best, likelihoods):  # type: ignore[no-untyped-def]
-    """Advance the framed trellis by one bit; ``best[state]`` becomes the state before on its best path."""
-    for state in range(len(metric)):
-        fresh[state] = UNLIKELY
-        best[state] = -1
-    for i in range(len(source)):
-        value = metric[source[i]] - cost[i]
-        if value > fresh[target[i]]:
-            fresh[target[i]] = value
-            best[target[i]] = source[i]
-    noise = len(metric) - 2 * CONTEXTS
+def framed_step(layout, metric, fresh, best, likelihoods):  # type: ignore[no-untyped-def]
+    """Advance the framed trellis by one bit; ``best[state]`` becomes the state before on its best path.
+
+    Args:
+        layout: a record of ``LAYOUT``.
+        metric, fresh: ``(STATES,)`` float64, changed in place; ``metric`` is ``UNLIKELY`` from the layout's last state on.
+        best: ``(STATES,)``, written.
+        likelihoods: log p of the bit's counts, ``(CONTEXTS,)`` float64.
+
+    Returns:
+        what the best metric rose by; it is 0 afterwards.
+    """
+    half, states, before = CONTEXTS // 2, layout.states, layout.before
+    end, idle, noise = _special_states(layout)
+    for to in range(PLACE, idle):
+        low = before[to]
+        high = low + half
+        higher = metric[high] > metric[low]
+        fresh[to] = metric[high] if higher else metric[low]
+        best[to] = high if higher else low
+    for place in (0, idle, noise):
+        fresh[place : place + PLACE] = UNLIKELY
+        best[place : place + PLACE] = 0
     for context in range(CONTEXTS):
-        nearest = context
-        for state in range(context, len(metric), CONTEXTS):
-            if metric[state] > metric[nearest]:
-                nearest = state
+        low, bit = context >> 1, context & 1
+        to = context + (idle if bit else 0)
+        for source, cost in ((end, IDLE_COST * bit), (idle, IDLE_STAY_COST), (noise, NOISE_EXIT_COST)):
+            _take(metric, fresh, best, source + low, to, cost)
+            _take(metric, fresh, best, source + low + half, to, cost)
+        _take(metric, fresh, best, noise + low, noise + context, NOISE_STAY_COST)
+        _take(metric, fresh, best, noise + low + half, noise + context, NOISE_STAY_COST)
+    _enter_noise(metric, fresh, best, states, noise)
+    tops = np.full(CONTEXTS, UNLIKELY)
+    for first in range(0, states, CONTEXTS):
+        for context in range(CONTEXTS):
+            value = fresh[first + context] + likelihoods[context]
+            fresh[first + context] = value
+            tops[context] = value if value > tops[context] else tops[context]
+    top = tops.max()
+    for state in range(states):
+        metric[state] = fresh[state] - top
+    return top
+
+
+@njit(cache=True, nogil=True)
+def _special_states(layout):  # type: ignore[no-untyped-def]
+    """Return the first states of the last bit of a frame, of idle and of noise."""
+    return (layout.length - 1) * PLACE, layout.length * PLACE, (layout.length + 1) * PLACE
+
+
+@njit(cache=True, nogil=True)
+def _take(metric, fresh, best, source, to, cost):  # type: ignore[no-untyped-def]
+    """Lead ``source`` to ``to`` if nothing better does."""
+    value = metric[source] - cost
+    if value > fresh[to]:
+        fresh[to] = value
+        best[to] = source
+
+
+@njit(cache=True, nogil=True)
+def _enter_noise(metric, fresh, best, states, noise):  # type: ignore[no-untyped-def]
+    """Lead the best state of each context to noise."""
+    value, nearest = np.full(CONTEXTS, UNLIKELY), np.zeros(CONTEXTS, np.int64)
+    for first in range(0, states, CONTEXTS):
+        for context in range(CONTEXTS):
+            here = metric[first + context]
+            if here > value[context]:
+                value[context] = here
+                nearest[context] = first + context
+    for context in range(CONTEXTS):
         for bit in range(2):
             to = noise + ((context << 1 | bit) & (CONTEXTS - 1))
-            if metric[nearest] - NOISE_COST > fresh[to]:
-                fresh[to] = metric[nearest] - NOISE_COST
-                best[to] = nearest
-    top = UNLIKELY
-    for state in range(len(metric)):
-        if fresh[state] > UNLIKELY / 2:
-            fresh[state] += likelihoods[state & (CONTEXTS - 1)]
-            top = max(top, fresh[state])
-    for state in range(len(metric)):
-        metric[state] = fresh[state] - top if fresh[state] > UNLIKELY / 2 else UNLIKELY
-    return top
+            _take(metric, fresh, best, nearest[context], to, NOISE_COST)
+
+
+@njit(cache=True, nogil=True)
+def framed_metric(layout):  # type: ignore[no-untyped-def]
+    """Return the metric with which every path begins alike, ``(STATES,)`` float64."""
+    metric = np.full(STATES, UNLIKELY)
+    metric[: layout.states] = 0.0
+    return metric
 
 
 @njit(cache=True, nogil=True)
@@ -190,17 +230,14 @@ def free_bits(likelihoods):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def framed_path(transitions, likelihoods):  # type: ignore[no-untyped-def]
+def framed_path(layouts, likelihoods):  # type: ignore[no-untyped-def]
     """Return the states on the most likely framed path, ``(n,)`` int32, and its log likelihood (nat)."""
-    count = len(likelihoods)
-    metric = np.zeros(transitions.states)
-    fresh = np.empty(transitions.states)
-    best = np.empty((count, transitions.states), np.int32)
+    layout, count = layouts[0], len(likelihoods)
+    metric, fresh = framed_metric(layout), np.empty(STATES)
+    best = np.empty((count, STATES), np.uint8)
     total = 0.0
     for n in range(count):
-        total += framed_step(
-            transitions.source, transitions.target, transitions.cost, metric, fresh, best[n], likelihoods[n]
-        )
+        total += framed_step(layout, metric, fresh, best[n], likelihoods[n])
     path = np.empty(count, np.int32)
     state = np.argmax(metric)
     for n in range(count - 1, -1, -1):
@@ -210,29 +247,42 @@ def framed_path(transitions, likelihoods):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def place_margin(transitions, likelihoods, at):  # type: ignore[no-untyped-def]
+def place_margin(layouts, likelihoods, at):  # type: ignore[no-untyped-def]
     """Return by how much (nat) the best path beats the best one on which the bit ``at`` has another place in its frame."""
-    metric = np.zeros(transitions.states)
-    fresh = np.empty(transitions.states)
-    best = np.empty(transitions.states, np.int32)
+    layout = layouts[0]
+    metric, fresh, best = framed_metric(layout), np.empty(STATES), np.empty(STATES, np.uint8)
     for n in range(at + 1):
-        framed_step(transitions.source, transitions.target, transitions.cost, metric, fresh, best, likelihoods[n])
-    source, target, cost = transitions.source, transitions.target, transitions.cost
-    later = np.zeros(transitions.states)
+        framed_step(layout, metric, fresh, best, likelihoods[n])
+    later = framed_metric(layout)
     for n in range(len(likelihoods) - 1, at, -1):
-        noise = transitions.states - 2 * CONTEXTS
-        for state in range(transitions.states):
-            to = (state << 1) & (CONTEXTS - 1)
-            low, high = later[noise + to] + likelihoods[n, to], later[noise + to + 1] + likelihoods[n, to + 1]
-            fresh[state] = max(low, high) - NOISE_COST
-        for i in range(len(source)):
-            value = later[target[i]] + likelihoods[n, target[i] & (CONTEXTS - 1)] - cost[i]
-            if value > fresh[source[i]]:
-                fresh[source[i]] = value
-        later[:] = fresh
-    places = np.full(transitions.length + 2, UNLIKELY)
-    for state in range(transitions.states):
-        place = state // (2 * CONTEXTS)
+        _framed_step_back(layout, later, fresh, likelihoods[n])
+    places = np.full(layout.length + 2, UNLIKELY)
+    for state in range(layout.states):
+        place = state // PLACE
         places[place] = max(places[place], metric[state] + later[state])
     places.sort()
     return places[-1] - places[-2]
+
+
+@njit(cache=True, nogil=True)
+def _framed_step_back(layout, later, fresh, likelihoods):  # type: ignore[no-untyped-def]
+    """Take the metric of what follows, ``(STATES,)`` float64, back by the bit that has these likelihoods."""
+    half, states, before = CONTEXTS // 2, layout.states, layout.before
+    end, idle, noise = _special_states(layout)
+    for state in range(states):
+        later[state] += likelihoods[state & (CONTEXTS - 1)]
+    for state in range(states):
+        to = noise + ((state << 1) & (CONTEXTS - 1))
+        fresh[state] = max(later[to], later[to + 1]) - NOISE_COST
+    for to in range(PLACE, idle):
+        low = before[to]
+        fresh[low] = max(fresh[low], later[to])
+        fresh[low + half] = max(fresh[low + half], later[to])
+    for context in range(CONTEXTS):
+        start = (context << 1) & (CONTEXTS - 1)  # of a frame, or idle with the next context
+        for source, cost in ((end, IDLE_COST), (idle, IDLE_STAY_COST), (noise, NOISE_EXIT_COST)):
+            begins = later[start] - (0.0 if source == end else cost)
+            fresh[source + context] = max(fresh[source + context], begins, later[idle + start + 1] - cost)
+        stays = max(later[noise + start], later[noise + start + 1]) - NOISE_STAY_COST
+        fresh[noise + context] = max(fresh[noise + context], stays)
+    later[:states] = fresh[:states]
