@@ -68,6 +68,8 @@ READ_BACK_CHARACTERS, REREAD_CHARACTERS = 400, 100
 
 _ROWS = 512
 
+_FEW_EVENTS, _MANY_GAPS = 4096, 16
+
 
 class SequenceDemodulator:
     """Demodulates one beacon; see the module.
@@ -92,6 +94,7 @@ class SequenceDemodulator:
         self._events = EventArrays(np.float64)
         self._gaps = np.empty((0, 2))  # whose events are missing
         self._known_to = -math.inf  # the stream's time
+        self._forget_at = _FEW_EVENTS  # with so many events in the buffer
         self._taken = 0  # events of the buffer that the lock has seen
         self._given_to = -math.inf  # end of the last character that was given out …
         self._read_to = -math.inf  # … or read, and not given out yet
@@ -142,7 +145,7 @@ class SequenceDemodulator:
                 self.share(*self._shared)
             self._restart(0.0 if self._searched_to_ns is None else max(0.0, float(self._searched_to_ns - self._origin_ns)))
         self._ended = None
-        self._events.append(t_ns - self._origin_ns, polarity)
+        self._events.append(t_ns, polarity, self._origin_ns)
         t_end = float(t_end_ns - self._origin_ns)
         if len(t_ns):
             for search in self._searches:
@@ -159,7 +162,9 @@ class SequenceDemodulator:
                     break
             elif not self._attempt(t_end):
                 break
-        self._forget(t_end)
+        if len(self._events) > self._forget_at or len(self._gaps) > _MANY_GAPS:
+            self._forget(t_end)
+            self._forget_at = max(2 * len(self._events), _FEW_EVENTS)
         self._known_to = t_end
         return characters
 
@@ -209,22 +214,23 @@ class SequenceDemodulator:
     def _follow(self, lock: Lock, t_end: float) -> tuple[int, list[Character]]:
         """Take events up to ``t_end``; return whether the lock holds, and the characters."""
         rows = self._rows
+        t, polarity = self._t, self._polarity
         refining = self._refine_at <= t_end
-        until = min(t_end, self._refine_at)
-        stop = int(np.searchsorted(self._t, until)) if refining else len(self._t)
+        until = self._refine_at if refining else t_end
+        stop = int(np.searchsorted(t, until)) if refining else len(t)
         count, taken, status = detect(
             lock.clock,
             lock.detection,
             self._layout,
             lock.inverted,
-            self._t[self._taken : stop],
-            self._polarity[self._taken : stop],
+            t[self._taken : stop],
+            polarity[self._taken : stop],
             until,
             self._gaps,
             rows,
         )
         self._taken += taken
-        characters = self._characters(rows[:count])
+        characters = self._characters(rows[:count]) if count else []
         if refining and status == STILL_LOCKED:
             self._refine(lock, stop)
             status = FULL
@@ -263,13 +269,13 @@ class SequenceDemodulator:
 
     def _characters(self, rows: NDArray[np.float64]) -> list[Character]:
         characters = []
-        for row in rows:
+        for row in rows.tolist():
             character = self._character(row)
             if character is None:
                 continue
             if self._trusted or row[KIND] in (KIND_OK, KIND_SEEN):
                 pending, self._pending = self._pending, None
-                if pending is not None and character.t_ns - pending.t_ns < ADJACENT_BITS * float(row[PERIOD_THEN]):
+                if pending is not None and character.t_ns - pending.t_ns < ADJACENT_BITS * row[PERIOD_THEN]:
                     characters.append(pending)
                 characters.append(character)
                 self._trusted = True
@@ -278,9 +284,9 @@ class SequenceDemodulator:
                 self._pending = character  # perhaps read into what was there before the beacon
         return characters
 
-    def _character(self, row: NDArray[np.float64]) -> Character | None:
+    def _character(self, row: list[float]) -> Character | None:
         """Return the character of a row, None if it is not to be given out."""
-        word, kind, period, start = int(row[WORD]), row[KIND], float(row[PERIOD_THEN]), float(row[BORDER_OF_START])
+        word, kind, period, start = int(row[WORD]), row[KIND], row[PERIOD_THEN], row[BORDER_OF_START]
         if kind == KIND_UNREADABLE or start < self._read_to - 0.5 * self._frame.length * period:
             return None
         self._read_to = start + self._frame.length * period
@@ -293,11 +299,11 @@ class SequenceDemodulator:
             t_ns=(self._origin_ns or 0) + round(start),
             code=code,
             status=status,
-            confidence=0.0 if kind == KIND_NOISE else confidence_of(float(row[MARGIN])),
+            confidence=0.0 if kind == KIND_NOISE else confidence_of(row[MARGIN]),
             frame=word,
             bit_rate_bps=NS_PER_S / period,
-            bit_llr=tuple(row[FIRST_RATIO:].tolist()),
-            edge_spread=float(row[SPREAD_THEN]),
+            bit_llr=tuple(row[FIRST_RATIO:]),
+            edge_spread=row[SPREAD_THEN],
         )
 
     # Searching
