@@ -62,9 +62,9 @@ def learn(histograms, counts, context, weight):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def logarithms(histograms, tables):  # type: ignore[no-untyped-def]
     """Write log p(compressed count | context) of all histograms, backed off, to ``tables``; same shape, float64."""
-    smooth = np.empty((CONTEXTS, LEVELS))
+    smooth, shared, own = np.empty((CONTEXTS, LEVELS)), np.empty(LEVELS), np.empty(LEVELS)
     for c in range(COUNTS):
-        shared = np.zeros(LEVELS)
+        shared[:] = 0.0
         for context in range(CONTEXTS):
             for level in range(LEVELS):
                 shared[level] += histograms[context, c, level]
@@ -76,7 +76,7 @@ def logarithms(histograms, tables):  # type: ignore[no-untyped-def]
             for last in range((1 << bits) - 1, -1, -1):
                 lent = smooth[last & ((1 << (bits - 1)) - 1)] if bits > 1 else shared
                 total = BACK_OFF
-                own = np.zeros(LEVELS)
+                own[:] = 0.0
                 for m in range(members):
                     context = m << bits | last
                     for level in range(LEVELS):

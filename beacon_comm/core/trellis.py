@@ -135,8 +135,8 @@ def framed_step(layout, metric, fresh, best, likelihoods):  # type: ignore[no-un
 
     Args:
         layout: a record of ``LAYOUT``.
-        metric, fresh: ``(STATES,)`` float64, changed in place; ``metric`` is ``UNLIKELY`` from the layout's last state on.
-        best: ``(STATES,)``, written.
+        metric: ``(STATES,)`` float64, changed in place; ``UNLIKELY`` behind the layout's last state.
+        fresh, best: room, ``(STATES,)`` float64 and uint8; behind the last state used for what is best of each context.
         likelihoods: log p of the bit's counts, ``(CONTEXTS,)`` float64.
 
     Returns:
@@ -162,7 +162,8 @@ def framed_step(layout, metric, fresh, best, likelihoods):  # type: ignore[no-un
         _take(metric, fresh, best, noise + low, noise + context, NOISE_STAY_COST)
         _take(metric, fresh, best, noise + low + half, noise + context, NOISE_STAY_COST)
     _enter_noise(metric, fresh, best, states, noise)
-    tops = np.full(CONTEXTS, UNLIKELY)
+    tops = fresh[states : states + CONTEXTS]
+    tops[:] = UNLIKELY
     for first in range(0, states, CONTEXTS):
         for context in range(CONTEXTS):
             value = fresh[first + context] + likelihoods[context]
@@ -192,7 +193,9 @@ def _take(metric, fresh, best, source, to, cost):  # type: ignore[no-untyped-def
 @njit(cache=True, nogil=True)
 def _enter_noise(metric, fresh, best, states, noise):  # type: ignore[no-untyped-def]
     """Lead the best state of each context to noise."""
-    value, nearest = np.full(CONTEXTS, UNLIKELY), np.zeros(CONTEXTS, np.int64)
+    value, nearest = fresh[states : states + CONTEXTS], best[states : states + CONTEXTS]
+    value[:] = UNLIKELY
+    nearest[:] = 0
     for first in range(0, states, CONTEXTS):
         for context in range(CONTEXTS):
             here = metric[first + context]
