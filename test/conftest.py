@@ -5,6 +5,10 @@ from pathlib import Path
 
 import pytest
 
+from beacon_comm.compiling.cache import ensure_compiler_cache
+
+ensure_compiler_cache()  # before anything imports numba
+
 PROJECT = Path(__file__).resolve().parents[1]
 
 

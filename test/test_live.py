@@ -178,7 +178,33 @@ def test_a_cache_that_cannot_be_made_is_replaced(tmp_path: Path) -> None:
     assert folder.parent == tmp_path and stat.S_IMODE(folder.stat().st_mode) == 0o700
 
 
-def _cache_folder(cache: Path, temporary: Path) -> str:
+def test_kernels_of_another_version_are_compiled_anew(tmp_path: Path) -> None:
+    """A kernel that was compiled against a type that is gone would keep the node from starting."""
+    package = tmp_path / 'beacon_comm'
+    rooms = ('core', 'wire', 'simulation')
+    kernels = [package / room / '__pycache__' / name for room in rooms for name in ('old.nbi', 'old.nbc')]
+
+    def start() -> None:
+        assert _cache_folder(package, tmp_path, given='') == 'None'
+
+    def compile_old() -> None:
+        for kernel in kernels:
+            kernel.parent.mkdir(parents=True, exist_ok=True)
+            kernel.touch()
+
+    compile_old()
+    (package / 'core' / 'stage.py').write_text('LEVEL = 1')
+    start()
+    assert not any(kernel.exists() for kernel in kernels)
+    compile_old()
+    start()
+    assert all(kernel.exists() for kernel in kernels)  # of this version
+    (package / 'core' / 'stage.py').write_text('LEVEL = 2')
+    start()
+    assert not any(kernel.exists() for kernel in kernels)
+
+
+def _cache_folder(cache: Path, temporary: Path, given: str | None = None) -> str:
     program = (
         'from pathlib import Path\n'
         'import beacon_comm.compiling.cache as cache\n'
@@ -186,7 +212,8 @@ def _cache_folder(cache: Path, temporary: Path) -> str:
         'print(cache.ensure_compiler_cache())\n'
     )
     environment = {
-        **os.environ, 'XDG_CACHE_HOME': str(cache), 'NUMBA_CACHE_DIR': str(cache), 'TMPDIR': str(temporary)
+        **os.environ, 'XDG_CACHE_HOME': str(cache), 'NUMBA_CACHE_DIR': str(cache) if given is None else given,
+        'TMPDIR': str(temporary),
     }
     done = subprocess.run([sys.executable, '-c', program], env=environment, capture_output=True, text=True, check=True)
     return done.stdout.strip()
