@@ -63,6 +63,7 @@ LEAD_IN_S, LEAD_IN, LEAD_OUT = 0.3, 16, 4
 # Signals are simulated for no longer than this (s) or the whole sonnet, but for so many characters at least.
 LONGEST_S, QUICK_S = 8.0, 1.5
 FEWEST = 30
+LEAST_DRAWN = {'message': -0.02, 'bit': 0.45}  # what lies below is drawn there
 NEAR_RADII, LEAST_RADIUS_PX = 1.5, 3.0
 
 # Outdoors: the LED, driver and lens of the 30 m recordings, which the simulator is calibrated on.
@@ -348,7 +349,7 @@ def draw_series(points: Sequence[Point], room: str, path: Path) -> None:
                     key=lambda one: one.bit_rate_bps,
                 )
                 x = [one.bit_rate_bps for one in own]
-                y = [getattr(one.transmission, f'{kind}_accuracy') for one in own]
+                y = [max(getattr(one.transmission, f'{kind}_accuracy'), LEAST_DRAWN[kind]) for one in own]
                 intervals = [interval_of(one.transmission, kind) for one in own]
                 colour = COLOURS[place % len(COLOURS)]
                 axes.fill_between(x, [i[0] for i in intervals], [i[1] for i in intervals], color=colour, alpha=0.1, linewidth=0)
@@ -357,7 +358,7 @@ def draw_series(points: Sequence[Point], room: str, path: Path) -> None:
                     label=f'{metres:g} m', clip_on=False, zorder=3 + place,
                 )  # fmt: skip
             axes.set_xscale('log')
-            axes.set_ylim(0.45 if row else -0.02, 1.02)
+            axes.set_ylim(LEAST_DRAWN[kind], 1.02)
             axes.yaxis.set_major_formatter(lambda value, _: f'{100 * value:g} %')
             axes.xaxis.set_major_formatter(lambda value, _: f'{value:g}')
             axes.xaxis.set_minor_formatter(NullFormatter())
