@@ -31,11 +31,12 @@ from numpy.typing import NDArray
 
 from beacon_comm.core.character import Character
 from beacon_comm.core.confirmation import ParityRecord
-from beacon_comm.core.demodulator import Demodulator, GapAware, Searching
+from beacon_comm.core.demodulator import Demodulator, GapAware, Recognising, Searching
 from beacon_comm.core.event_buffer import buffer_length_ns
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.routing import Routed
+from beacon_comm.core.signature import Signature
 from beacon_comm.core.tracks import Track
 
 UNSETTLED_BITS = 1.0
@@ -272,6 +273,11 @@ class CandidateSlots:
         """Return the standard deviation of that bit rate (bit/s), None where it is not estimated."""
         slot = self._slots.get(track_id)
         return None if slot is None else slot.demodulator.bit_rate_std_bps
+
+    def signature(self, track_id: int) -> Signature | None:
+        """Return how the beacon of a track can be known again, None while it is not read or the receiver cannot say."""
+        slot = self._slots.get(track_id)
+        return slot.demodulator.signature() if slot is not None and isinstance(slot.demodulator, Recognising) else None
 
     def confirmed_at_ns(self, track_id: int) -> int | None:
         """Return the end of the character that confirmed a track (ns), None if it is not confirmed."""

@@ -13,6 +13,7 @@ from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.rate_bank import RateBank
 from beacon_comm.core.sequence import SequenceDemodulator
 from beacon_comm.core.sequence_detection import DELAY_FRAMES
+from beacon_comm.core.signature import Signature
 from beacon_comm.core.synchronisation import BITS_AFTER_DUE
 from beacon_comm.core.threshold import ThresholdDemodulator
 
@@ -20,6 +21,7 @@ __all__ = [
     'Demodulator',
     'GapAware',
     'RateBank',
+    'Recognising',
     'Searching',
     'SequenceDemodulator',
     'ThresholdDemodulator',
@@ -83,6 +85,15 @@ class Searching(Protocol):
 
     def searched(self, to_ns: int) -> None:
         """Hear, before the first events, that those before ``to_ns`` (ns) have been searched: read them, if need be."""
+        ...
+
+
+@runtime_checkable
+class Recognising(Protocol):
+    """A demodulator that can say how the beacon it reads can be known again."""
+
+    def signature(self) -> Signature | None:
+        """Return the beacon's signature now, None while it is not read."""
         ...
 
 

@@ -84,6 +84,7 @@ class Detector:
         self._router: Router = make_router(self._parameters, sensor_size)
         self._t_hop_ns: int | None = None  # the last point of the hop grid
         self._early = TrackChanges()  # changes at hops that route() had to catch up with
+        self._to_exchange: list[tuple[int, int]] = []
 
     @property
     def tracks(self) -> Mapping[int, Track]:
@@ -145,6 +146,10 @@ class Detector:
         """Let a track go on under a label of its own from the next hop on."""
         self._tracker.disown(track_id)
 
+    def exchange(self, track_id: int, other_id: int) -> None:
+        """Let two tracks go on where the other one is, from the next hop on."""
+        self._to_exchange.append((track_id, other_id))
+
     def backlog(self, track_id: int) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
         """Return the buffered events of a track: times (ns), ``(n,)`` int64, and ±1, ``(n,)`` int8.
 
@@ -172,6 +177,7 @@ class Detector:
     def _step(self, t_hop_ns: int) -> TrackChanges:
         """Take one hop; the paper's detection, one call a stage."""
         self._images.push(self._router.close())
+        self._exchange()
         blobs = self._blobs.find(self._images, t_hop_ns)
         changes = self._tracker.update(blobs, t_hop_ns)
         self._keep_buffers(blobs, changes, t_hop_ns)
@@ -182,6 +188,13 @@ class Detector:
         self._stats.new_tracks += len(changes.new)
         self._stats.lost_tracks += len(changes.lost)
         return changes
+
+    def _exchange(self) -> None:
+        for one, other in self._to_exchange:
+            if one in self._tracker.tracks and other in self._tracker.tracks:
+                self._tracker.exchange(one, other)
+                self._buffers[one], self._buffers[other] = self._buffers[other], self._buffers[one]
+        self._to_exchange.clear()
 
     def _keep_buffers(self, blobs: list[Blob], changes: TrackChanges, t_hop_ns: int) -> None:
         for old, new in changes.renamed:

@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,6 +116,8 @@ class MotionTrack(Track):
         origin_ns: the hop that the row's times count from (ns).
         latency_s: of the sensor (s): how much later than the light an event is.
     """
+
+    WHERE: ClassVar[tuple[str, ...]] = (*Track.WHERE, 'row', 'origin_ns', 'steady')
 
     row: NDArray[np.float64] = field(default_factory=lambda: np.zeros(motion.WIDTH))
     origin_ns: int = 0
@@ -411,20 +414,9 @@ class MotionTracker(Tracker):
                 for other in tracks:
                     near = math.dist(before.position_at(t_hop_ns), other.position_at(t_hop_ns)) <= other.extent_px + gate
                     if near and not other.quiet and other.bit_rate_bps is None and before.fits(other):
-                        self._exchange(track, other)
+                        self.exchange(track.track_id, other.track_id)
                         break
         return left
-
-    def _exchange(self, track: MotionTrack, other: MotionTrack) -> None:
-        """Let two tracks go on where the other one was."""
-        track.row, other.row = other.row.copy(), track.row.copy()
-        track.origin_ns, other.origin_ns = other.origin_ns, track.origin_ns
-        for name in ('extent_px', 'index', 'last_seen_ns', 'matched_ns', 'quiet'):
-            mine, its = getattr(track, name), getattr(other, name)
-            setattr(track, name, its)
-            setattr(other, name, mine)
-        track.settle()
-        other.settle()
 
     def _take_over(self, older: MotionTrack, younger: MotionTrack) -> None:
         """Let a quiet track go on where a younger one is."""

@@ -27,6 +27,7 @@ from beacon_comm.core.demodulator import make_demodulator
 from beacon_comm.core.detection import Detector
 from beacon_comm.core.events import NS_PER_S, EventBatch
 from beacon_comm.core.index_image import hop_length_ns
+from beacon_comm.core.meetings import Meetings
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.routing import Routed
 from beacon_comm.core.signal_detection import WholeSignal
@@ -111,6 +112,7 @@ class Detection(Protocol):
     def hop(self, t_hop_ns: int) -> TrackChanges: ...
     def backlog(self, track_id: int) -> tuple[NDArray[np.int64], NDArray[np.int8]]: ...
     def disown(self, track_id: int) -> None: ...
+    def exchange(self, track_id: int, other_id: int) -> None: ...
     def resize(self, sensor_size: tuple[int, int]) -> TrackChanges: ...
     def reset(self) -> TrackChanges: ...
 
@@ -139,6 +141,7 @@ class Receiver:
         self._t_ns: int | None = None
         self._confirmed: tuple[int, ...] = ()
         self._settled_ns: dict[int, int] = {}
+        self._meetings = Meetings()
 
     def push(self, batch: EventBatch) -> Output:
         """Take the next events; the paper's section III, one call a stage.
@@ -157,6 +160,7 @@ class Receiver:
                 self._lose(changes, characters, lost)
                 characters += self._slots.assign(self._detection.tracks, segment.t_end_ns, self._detection.backlog)
                 self._compare_rates(segment.t_end_ns)
+                self._tell_apart(segment.t_end_ns)
         return self._output(characters, lost)
 
     def flush(self) -> Output:
@@ -221,6 +225,12 @@ class Receiver:
         self._t_ns = batch.t_end_ns
         yield batch.slice(start, len(batch), batch.t_end_ns), False
 
+    def _tell_apart(self, t_ns: int) -> None:
+        """Give the beacons that have exchanged their tracks their labels back."""
+        detection = self._detection
+        for one, other in self._meetings.exchanged(detection.tracks, self._slots.signature, detection.backlog, t_ns):
+            detection.exchange(one, other)
+
     def _compare_rates(self, t_ns: int) -> None:
         """Tell the tracks their bit rates; take the label from one that has it of a lost one with another rate."""
         before_ns, self._settled_ns = self._settled_ns, {}
@@ -246,6 +256,7 @@ class Receiver:
 
     def _restart(self, changes: TrackChanges) -> Output:
         self._settled_ns = {}
+        self._meetings.clear()
         characters: list[ReceivedCharacter] = []
         lost: list[BeaconSnapshot] = []
         self._lose(changes, characters, lost)

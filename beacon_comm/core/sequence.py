@@ -49,6 +49,7 @@ from beacon_comm.core.sequence_detection import (
     silent_since,
     start_at,
 )
+from beacon_comm.core.signature import Signature
 from beacon_comm.core.soft_decision import confidence_of
 from beacon_comm.core.trellis import frame_layout
 
@@ -129,6 +130,13 @@ class SequenceDemodulator:
             return None
         clock = lock.clock[0]
         return math.sqrt(float(clock['p_period'])) * NS_PER_S / float(clock['period'])
+
+    def signature(self) -> Signature | None:
+        """Return how the beacon can be known again; see :class:`beacon_comm.core.demodulator.Recognising`."""
+        lock = self._lock
+        if lock is None or self._origin_ns is None:
+            return None
+        return Signature(lock.clock.copy(), lock.detection.copy(), self._layout, lock.inverted, self._origin_ns)
 
     @property
     def given_up(self) -> bool:

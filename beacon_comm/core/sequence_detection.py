@@ -299,8 +299,59 @@ def _wake(clock, state, layout, gaps, t):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def explain(clocks, states, layouts, inverted, t, polarity, start, stop):  # type: ignore[no-untyped-def]
+    """Return how likely events are (log p, nat) to be those of a locked signal, in the bits between two times.
+
+    The clock only predicts, and nothing is learnt.
+
+    Args:
+        clocks, states, layouts, inverted: see :func:`detect`; of the signal some time before, changed in place.
+        t, polarity: see :func:`detect`.
+        start, stop: the first bit begins, and the last one ends, between these times (ns from the origin).
+
+    Returns:
+        log p, and whether the clock is still sure enough to say.
+    """
+    clock, state, layout = clocks[0], states[0], layouts[0]
+    skipped = np.floor((start - clock.border) / clock.period) + 1.0
+    if skipped > 0.0:
+        go_on(clock, skipped)
+    place = np.argmax(state.metric) // PLACE
+    if place < layout.length:
+        place = (place + int(skipped)) % layout.length
+    state.metric[: layout.states] = -UNKNOWN_PLACE_COST
+    state.metric[place * PLACE : (place + 1) * PLACE] = 0.0
+    clock.frozen, state.bit = True, MEMORY_BITS
+    gaps, total = np.empty((0, 2)), 0.0
+    i = np.searchsorted(t, clock.border)
+    while clock.border + clock.period <= stop:
+        i = take_events(clock, t, polarity, i, -1 if inverted else 1, False)
+        total += framed_step(layout, state.metric, state.fresh, state.source, _weigh_bit(clock, state, gaps))
+        state.bit += 1
+        go_on(clock, 1)
+    return total, clock.p_phase <= MOST_UNSURE * MOST_UNSURE
+
+
+@njit(cache=True, nogil=True)
 def _close_bit(clock, state, layout, gaps, rows, count):  # type: ignore[no-untyped-def]
     """Take the present bit, whose events are all there; return the number of rows."""
+    likelihoods = _weigh_bit(clock, state, gaps)
+    _step_free(state, likelihoods)
+    decided = state.free_bits[np.argmax(state.free_metric)] >> EDGE_LAG
+    if (decided ^ decided >> 1) & 1 and state.bit >= EDGE_LAG + MEMORY_BITS:
+        beside_gap = False
+        for back in range(EDGE_LAG + 2):
+            beside_gap |= state.silent[(state.bit - back) & _RING_MASK] == MISSING
+        if not beside_gap:
+            see_edge(clock, decided & 1)
+    best = _step_framed(state, layout, likelihoods)
+    state.bit += 1
+    return _decide(clock, state, layout, best, DELAY_FRAMES * layout.length, rows, count)
+
+
+@njit(cache=True, nogil=True)
+def _weigh_bit(clock, state, gaps):  # type: ignore[no-untyped-def]
+    """Take the counts of the present bit; return log p of them, ``(CONTEXTS,)``."""
     place = state.bit & _RING_MASK
     counts, events = state.counts[place], clock.counts
     gain, silence = state.gain, state.silence
@@ -323,17 +374,7 @@ def _close_bit(clock, state, layout, gaps, rows, count):  # type: ignore[no-unty
     state.silent[place] = silent
     if state.bit < MEMORY_BITS - 1 or silent == MISSING or (silent and silence < RARELY_SILENT):
         likelihoods[:] = 0.0  # an erasure, or before the first event
-    _step_free(state, likelihoods)
-    decided = state.free_bits[np.argmax(state.free_metric)] >> EDGE_LAG
-    if (decided ^ decided >> 1) & 1 and state.bit >= EDGE_LAG + MEMORY_BITS:
-        beside_gap = False
-        for back in range(EDGE_LAG + 2):
-            beside_gap |= state.silent[(state.bit - back) & _RING_MASK] == MISSING
-        if not beside_gap:
-            see_edge(clock, decided & 1)
-    best = _step_framed(state, layout, likelihoods)
-    state.bit += 1
-    return _decide(clock, state, layout, best, DELAY_FRAMES * layout.length, rows, count)
+    return likelihoods
 
 
 @njit(cache=True, nogil=True)

@@ -70,6 +70,9 @@ class WholeSignal:
     def disown(self, track_id: int) -> None:
         """Do nothing: a lost signal's label never comes back."""
 
+    def exchange(self, track_id: int, other_id: int) -> None:
+        """Do nothing: there are no two signals."""
+
     def backlog(self, track_id: int) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
         """Return the buffered events: times (ns), ``(n,)`` int64, and ±1, ``(n,)`` int8."""
         return self._buffer.events()

@@ -23,6 +23,7 @@ import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from numba import njit
@@ -68,6 +69,12 @@ class Track:
         variance: of position (px²), of position and velocity (px²/s), of velocity (px²/s²), one axis.
         noise: white acceleration (px²/s³) that the variance grows by.
     """
+
+    WHERE: ClassVar[tuple[str, ...]] = (
+        'x_px', 'y_px', 'vx_px_per_s', 'vy_px_per_s', 't_ns', 'extent_px', 'index', 'last_seen_ns', 'matched_ns', 'quiet',
+        'covered_since_ns', 'variance', 'noise',
+    )  # fmt: skip
+    """The fields that say where something is, not what."""
 
     track_id: int
     x_px: float
@@ -218,6 +225,14 @@ class Tracker:
         room = max(0, self._parameters.max_tracks - len(self._tracks))
         new = tuple(self._new_track(blobs[j], t_hop_ns, tried_ns) for tried_ns, j in left[:room])
         return TrackChanges(new, lost + evicted, tuple(j for _, j in left[:room]), len(left) - len(new))
+
+    def exchange(self, track_id: int, other_id: int) -> None:
+        """Let two tracks go on where the other one is."""
+        one, other = self._tracks[track_id], self._tracks[other_id]
+        for name in one.WHERE:
+            mine, its = getattr(one, name), getattr(other, name)
+            setattr(one, name, its)
+            setattr(other, name, mine)
 
     def disown(self, track_id: int) -> None:
         """Take a label from a track that is not what it was given it for."""
