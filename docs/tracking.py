@@ -19,7 +19,7 @@ import argparse
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from beacon_comm.core.candidates import ReceivedCharacter
+from beacon_comm.core.candidates import BeaconState, ReceivedCharacter
 from beacon_comm.core.detection import Detector
 from beacon_comm.core.events import NS_PER_S, EventBatch
 from beacon_comm.core.index_image import hop_length_ns
@@ -57,9 +57,14 @@ def parameters(**changes: Any) -> Parameters:
     return Parameters(**{'bit_rates': (BIT_RATE,), **changes})
 
 
-def scene(paths: list[dict[str, Any]], duration_s: float, seed: int, **content: Any) -> Simulated:
+def scene(
+    paths: list[dict[str, Any]], duration_s: float, seed: int, starts_s: Sequence[float] = (0.05, 0.05), **content: Any
+) -> Simulated:
     """Return a scene of one beacon a path."""
-    beacons = [{'bit_rate_bps': BIT_RATE, 'text': TEXTS[k % 2], 'path': path} for k, path in enumerate(paths)]
+    beacons = [
+        {'bit_rate_bps': BIT_RATE, 'text': TEXTS[k % 2], 'path': path, 'start_s': starts_s[k % 2]}
+        for k, path in enumerate(paths)
+    ]
     return simulate(make_description({'duration_s': duration_s, 'beacons': beacons, **content}), seed=seed)
 
 
@@ -157,11 +162,11 @@ def follow(simulated: Simulated, at_hop: Callable[[Detector, SceneTruth, int], N
         at_hop(detector, truth, t_hop_ns)
 
 
-def nearest(detector: Detector, truth: BeaconTruth, t_ns: int) -> tuple[Track | None, float]:
+def nearest(tracks: Iterable[Track], truth: BeaconTruth, t_ns: int) -> tuple[Track | None, float]:
     """Return the track nearest to a beacon, and how far it is (px)."""
     x, y = (float(value) for value in truth.centre(t_ns))
     best, least = None, math.inf
-    for track in detector.tracks.values():
+    for track in tracks:
         distance = math.hypot(*np.subtract(track.light_at(t_ns), (x, y)))
         if distance < least and not track.quiet:
             best, least = track, distance
@@ -194,7 +199,8 @@ def crossing(seed: int, near: bool, speed: float = 500.0) -> tuple[Simulated, fl
     """Return a scene of two beacons that pass one another, when they begin to, and its duration (s).
 
     They come at ``speed`` relative to one another from any direction, shared between them in any way, past one another by
-    0 to 3 radii; ``near``: they stood 3 radii apart before, else 20.
+    0 to 3 radii; ``near``: they stood 3 radii apart before, else 20.  Each begins to send at a time of its own, as beacons that
+    know nothing of one another do.
     """
     random = np.random.default_rng(seed)
     angle, share = random.uniform(0, 2 * math.pi), random.uniform(0.2, 0.8)
@@ -210,27 +216,35 @@ def crossing(seed: int, near: bool, speed: float = 500.0) -> tuple[Simulated, fl
         points = [[0.0, *begin], [hold_s, *begin], [hold_s + moving_s, *end], [hold_s + moving_s + 0.15, *end]]
         paths.append({'kind': 'waypoints', 'points': [[float(value) for value in point] for point in points]})
     duration_s = hold_s + moving_s + 0.12
-    return scene(paths, duration_s, seed), hold_s, duration_s
+    starts_s = [float(start_s) for start_s in random.uniform(0.0, BITS / BIT_RATE, 2)]
+    return scene(paths, duration_s, seed, starts_s), hold_s, duration_s
 
 
-def labels_of(detector: Detector, truth: SceneTruth, t_ns: int) -> list[int | None]:
-    """Return the label of each beacon, None where no track is within a radius."""
-    found = [nearest(detector, beacon, t_ns) for beacon in truth.beacons]
-    return [track.track_id if track is not None and distance < RADIUS_PX else None for track, distance in found]
+def labels_of(receiver: Receiver, truth: SceneTruth, t_ns: int) -> list[int | None]:
+    """Return the label of each beacon, None where no track that is read, or better confirmed, is within a radius."""
+    found: list[int | None] = []
+    for beacon in truth.beacons:
+        x, y = (float(value) for value in beacon.centre(t_ns))
+        here = [
+            (one.state is not BeaconState.CONFIRMED, math.hypot(one.x_px - x, one.y_px - y), one.track_id)
+            for one in receiver.beacons(t_ns)
+            if one.bit_rate_bps is not None and not one.quiet and math.hypot(one.x_px - x, one.y_px - y) < RADIUS_PX
+        ]
+        found.append(min(here)[2] if here else None)
+    return found
 
 
 def cross(seed: int, near: bool, tracker: str) -> str:
     """Return how a crossing ended: kept, swapped, or lost (a label that is gone)."""
-    simulated, hold_s, _ = crossing(seed, near)
-    seen: dict[str, list[int | None]] = {}
-
-    def look(detector: Detector, truth: SceneTruth, t_ns: int) -> None:
-        if t_ns >= (hold_s - 0.02) * NS_PER_S:
-            seen.setdefault('before', labels_of(detector, truth, t_ns))
-        seen['after'] = labels_of(detector, truth, t_ns)
-
-    follow(simulated, look, tracker=tracker)
-    before, after = seen['before'], seen['after']
+    (batches, truth), hold_s, _ = crossing(seed, near)
+    receiver = Receiver(parameters(tracker=tracker), (truth.width, truth.height))
+    before: list[int | None] = []
+    after = before
+    for batch in batches:
+        receiver.push(batch)
+        after = labels_of(receiver, truth, batch.t_end_ns)
+        if not before and batch.t_end_ns >= (hold_s - 0.02) * NS_PER_S:
+            before = after
     return 'kept' if before == after and None not in before else 'swapped' if before == after[::-1] else 'lost'
 
 
@@ -331,7 +345,7 @@ def looked_at(simulated: Simulated, kind: str) -> np.ndarray:
             t_s = t_ns / NS_PER_S
             if not BEGIN_S <= t_s < ERRORS_S or np.any((t_s > out_s) & (t_s < out_s + 0.02)):
                 continue
-            track, distance = nearest(detector, beacon, t_ns)
+            track, distance = nearest(detector.tracks.values(), beacon, t_ns)
             if track is None or distance > 5 * RADIUS_PX:
                 rows.append([math.nan] * 4)
                 continue
@@ -413,7 +427,9 @@ after each turn, and a circle of 200 px radius. In parentheses: 95 % intervals (
 SECTIONS = (
     ('crossings', 'Two beacons that pass one another',
      'At 500 px/s relative to one another, past one another by 0 to 3 radii, from 20 radii apart, or after standing 3 radii\n'
-     'apart.\n'),
+     'apart; the whole receiver, which tells them by their signals when they are apart again\n'
+     '([meetings.py](../beacon_comm/core/meetings.py)).  Each began to send at a time of its own: beacons whose bits lie\n'
+     'alike cannot be told so.  *kept*: the labels 20 ms before are those at the end, 120 ms after the last motion.\n'),
     ('many', 'Beacons at once', 'On a grid, the camera shaken by 5 px; shares of characters right.\n'),
     ('hidden', 'Hidden for a moment', 'Characters missed: sent after it is back, before three in a row are right.\n'),
     ('shaken', 'A camera shaken over texture', 'On 1280 × 720; `index_threshold` at its default and raised.\n'),
