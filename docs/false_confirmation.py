@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Work out how often noise and lamps are confirmed by chance; print the tables of confirmation.md.
 
-    python docs/false_confirmation.py            # about three minutes
-    python docs/false_confirmation.py --full     # all of the lamp sweep, about twenty minutes
+    python docs/false_confirmation.py            # about six minutes
+    python docs/false_confirmation.py --full     # all of the lamp sweep, about twenty-five minutes
 """
 
 from __future__ import annotations
@@ -11,17 +11,18 @@ import argparse
 import itertools
 import math
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beacon_comm.core.character import Character, Status
 from beacon_comm.core.confirmation import SLIPPED_BITS, ParityRecord, Verdict
-from beacon_comm.core.demodulator import ThresholdDemodulator
+from beacon_comm.core.demodulator import ThresholdDemodulator, make_demodulator
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.parameters import Parameters
+from beacon_comm.evaluation.scoring import wilson_interval
 from beacon_comm.simulation.led import Burst, LedModel, noise, square_wave
 
 RATES_BPS = (20.0, 100.0, 504.0, 1000.0, 3125.0, 10_000.0)
@@ -47,6 +48,32 @@ So long lives this, and this gives life to thee.
 # Lines that change at random, read by the real demodulator
 
 
+@dataclass(frozen=True, slots=True)
+class RandomLine:
+    """A line that changes at random: its bits are ones with some probability, or its edges come with some density (1/bit)."""
+
+    ones: float = 0.0
+    density: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """What the tables call it."""
+        return f'random edges, {self.density:g} a bit' if self.density else f'random bits, {self.ones:.0%} ones'
+
+    def edges(self, bits: int, random: np.random.Generator) -> NDArray[np.float64]:
+        """Return when the line changes (bit periods), the first time to 0, ``(n,)``."""
+        if self.density:
+            return np.cumsum(random.exponential(1 / self.density, round(bits * self.density)))
+        line = np.concatenate(([True], random.random(bits) < self.ones))
+        return np.flatnonzero(np.diff(line)).astype(float)
+
+
+KINDS = (
+    *(RandomLine(ones) for ones in (0.3, 0.5, 0.7)),
+    *(RandomLine(density=density) for density in (0.1, 0.2, 0.3, 0.5, 1.0)),
+)
+
+
 def read(bit_rate_bps: float, events: tuple[NDArray[np.int64], NDArray[np.int8]]) -> list[Character]:
     """Return the characters that the paper's demodulator reads at one rate."""
     demodulator = ThresholdDemodulator(bit_rate_bps, Parameters(bit_rates=(bit_rate_bps,)))
@@ -63,16 +90,24 @@ def events_of_edges(t_bits: NDArray[np.float64], bit_rate_bps: float) -> tuple[N
 def random_lines(bits: int, bit_rate_bps: float) -> Iterator[tuple[str, list[Character]]]:
     """Yield what lines are, and what is read from ``bits`` bit periods of them."""
     random = np.random.default_rng(1)
-    for ones in (0.3, 0.5, 0.7):
-        line = np.concatenate(([True], random.random(bits) < ones))
-        edges = np.flatnonzero(np.diff(line)).astype(float)
-        yield f'random bits, {ones:.0%} ones', read(bit_rate_bps, events_of_edges(edges, bit_rate_bps))
-    for density in (0.1, 0.2, 0.3, 0.5, 1.0):
-        edges = np.cumsum(random.exponential(1 / density, round(bits * density)))
-        yield f'random edges, {density:g} a bit', read(bit_rate_bps, events_of_edges(edges, bit_rate_bps))
+    for kind in KINDS:
+        yield kind.name, read(bit_rate_bps, events_of_edges(kind.edges(bits, random), bit_rate_bps))
     for density in (1, 10, 100):
         events = noise(density * bit_rate_bps, bits / bit_rate_bps, t0_ns=T0_NS, seed=2)
         yield f'noise events, {density} a bit', read(bit_rate_bps, events)
+
+
+def vouching(characters: list[Character]) -> NDArray[np.bool_]:
+    """Return which characters vouch, as the parity record has it, ``(n,)``."""
+    p = Parameters()
+    sure = [
+        one.status == Status.OK
+        or (one.status == Status.REPAIRED and one.read_freely and one.confidence >= p.confirm_free_confidence)
+        for one in characters
+    ]
+    t_ns = np.array([one.t_ns for one in characters])
+    bits = np.diff(t_ns, prepend=t_ns[:1] - NS_PER_S) * np.array([one.bit_rate_bps for one in characters]) / NS_PER_S
+    return np.array(sure, np.bool_) & (bits >= FRAME.length - SLIPPED_BITS)
 
 
 def chances(characters: list[Character]) -> tuple[float, float, float, float]:
@@ -81,23 +116,21 @@ def chances(characters: list[Character]) -> tuple[float, float, float, float]:
     The last is the share of 12 random ones of those that vouch, as if they came in a row and all others were wrong.
     """
     statuses = np.array([character.status for character in characters])
-    t_ns = np.array([character.t_ns for character in characters])
-    bits = np.diff(t_ns, prepend=t_ns[0] - NS_PER_S) * characters[0].bit_rate_bps / NS_PER_S
     ok = statuses == Status.OK
-    vouches = ok & (bits >= FRAME.length - SLIPPED_BITS)
+    vouches = vouching(characters)
     right = statuses != Status.PARITY_ERROR
-    vouching = [characters[k] for k in np.flatnonzero(vouches)]
-    return float(vouches.mean()), float(ok.mean()), float(right.mean()), varied(vouching)
+    varies = varied([characters[k] for k in np.flatnonzero(vouches)])
+    return float(vouches.mean()), float(ok.mean()), float(right.mean()), varies
 
 
-def varied(vouching: list[Character], trials: int = 2000) -> float:
+def varied(vouchers: list[Character], trials: int = 2000) -> float:
     """Return the share of windows drawn from characters that the rules on variety let pass."""
     p = Parameters(confirm_window=12, judged_last=1, judged_right=0)
     random, passed = np.random.default_rng(5), 0
-    for drawn in random.integers(len(vouching), size=(trials, p.confirm_window)):
+    for drawn in random.integers(len(vouchers), size=(trials, p.confirm_window)):
         record = ParityRecord(p)
         for k, index in enumerate(drawn):
-            record.push(replace(vouching[index], t_ns=k * NS_PER_S))
+            record.push(replace(vouchers[index], t_ns=k * NS_PER_S))
         passed += record.confirmed
     return passed / trials
 
@@ -146,8 +179,8 @@ def print_random_lines(bits: int) -> None:
     p = Parameters()
     print('\n## Lines that change at random, read at 504 bps\n')
     print('| line | counted characters a frame | parity right | ok | vouches | varied', end='')
-    print(' | a slot and hour, 504 bps | 10 kbps | 504 bps, slips vouching |')
-    print('|---|---|---|---|---|---|---|---|---|')
+    print(' | a candidate | a slot and hour, 504 bps | 10 kbps | 504 bps, slips vouching |')
+    print('|---|---|---|---|---|---|---|---|---|---|')
     for name, characters in random_lines(bits, 504.0):
         vouches, ok, right, varies = chances(characters)
         per_character = confirmations_per_character(vouches, right, p) * varies
@@ -156,7 +189,45 @@ def print_random_lines(bits: int) -> None:
         slipping = confirmations_per_character(ok, right, p) * varies
         print(
             f'| {name} | {counted:.2f} | {right:.3f} | {ok:.3f} | {vouches:.3f} | {varies:.3f} |'
-            f' {per_character * hours[0]:.1e} | {per_character * hours[1]:.1e} | {slipping * hours[0]:.1e} |'
+            f' {per_character * p.turn_characters:.1e} | {per_character * hours[0]:.1e} |'
+            f' {per_character * hours[1]:.1e} | {slipping * hours[0]:.1e} |'
+        )
+
+
+def characters_after(kind: RandomLine, runs: int, bit_rate_bps: float = 504.0) -> list[list[Character]]:
+    """Return what the sequence receiver reads, run by run, after a beacon that it has locked on turns into a random line."""
+    random = np.random.default_rng(7)
+    text = np.concatenate(([1], FRAME.encode_bits(SONNET[:60]), [1])).astype(np.int64)
+    from_text, behind_ns = np.flatnonzero(np.diff(text)).astype(float), len(text) * NS_PER_S / bit_rate_bps
+    found = []
+    for _ in range(runs):
+        edges = np.concatenate((from_text, len(text) + kind.edges(40 * FRAME.length, random)))
+        demodulator = make_demodulator(Parameters(bit_rates=(bit_rate_bps,), rate_search='listed'))
+        events = events_of_edges(edges, bit_rate_bps)
+        characters = demodulator.push(*events, int(events[0][-1]) + 1) + demodulator.flush()
+        found.append([character for character in characters if character.t_ns >= T0_NS + behind_ns])
+    return found
+
+
+def print_sequence(bits: int, runs: int) -> None:
+    """Print what is left to chance with the sequence receiver: whether it locks, and what vouches behind a lock that it had."""
+    p = Parameters()
+    print('\n## The sequence receiver on them\n')
+    print('| line | frames without a lock | characters behind a lock | vouch | after one that does | a lock (97.5 %) |')
+    print('|---|---|---|---|---|---|')
+    for kind in KINDS:
+        edges = events_of_edges(kind.edges(bits, np.random.default_rng(3)), 504.0)
+        demodulator = make_demodulator(Parameters(bit_rates=(504.0,), rate_search='listed'))
+        locked = len(demodulator.push(*edges, int(edges[0][-1]) + 1) + demodulator.flush())
+        lines = [vouching(characters) for characters in characters_after(kind, runs)]
+        count, some = sum(map(len, lines)), sum(int(line.sum()) for line in lines)
+        before = sum(int(line[:-1].sum()) for line in lines)
+        again = sum(int((line[:-1] & line[1:]).sum()) for line in lines)
+        most = max(wilson_interval(some / count, count).high, again / max(before, 1))
+        chance = confirmations_per_character(most, 0.5, p) * p.turn_characters
+        print(
+            f'| {kind.name} | {bits / FRAME.length:.0f}{f", but {locked} characters" if locked else ""} | {count / runs:.1f} |'
+            f' {some / count:.3f} | {again} of {before} | {chance:.1e} |'
         )
 
 
@@ -301,6 +372,7 @@ def main() -> None:
     full = parser.parse_args().full
     print_paper_rule()
     print_random_lines(1_000_000)
+    print_sequence(1_000_000, 300 if full else 100)
     print_check()
     print_price()
     print_lamps(full)
