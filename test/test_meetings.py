@@ -109,12 +109,13 @@ def test_beacons_whose_bits_lie_alike_keep_what_they_have():
     assert scene.exchanged() == []
 
 
+@pytest.mark.parametrize('rate_bps', [None, RATE_BPS])
 @pytest.mark.parametrize(('seen', 'expected'), [(0, [(2, 3)]), (1, [(1, 3), (2, 3)])])
-def test_a_beacon_whose_track_was_thrown_off_is_found_in_a_new_one(seen, expected):
+def test_a_beacon_whose_track_was_thrown_off_is_found_in_a_new_one(seen, expected, rate_bps):
     scene = Scene(beacon(0), beacon(1, 2_300_000))
     scene.quiet = {2}
     scene.has = {1: scene.beacons[seen], 2: scene.beacons[1 - seen], 3: scene.beacons[1 - seen]}
-    scene.began_ns[3], scene.rates[3] = APART_NS, None
+    scene.began_ns[3], scene.rates[3] = APART_NS, rate_bps
     assert scene.exchanged() == expected
 
 

@@ -118,7 +118,7 @@ def _decide(
         (gone,) = (track_id for track_id in pair if track_id not in seen)
         signatures = meeting.signatures if gone == pair[1] else meeting.signatures[::-1]
         for track in tracks.values():
-            if track.bit_rate_bps is None and not track.quiet and track.first_seen_ns >= meeting.began_ns:
+            if not track.quiet and track.first_seen_ns >= meeting.began_ns:
                 events = [backlog(seen[0]), backlog(track.track_id)]
                 since_ns = max(meeting.apart_ns, track.first_seen_ns)
                 verdict = _have_exchanged(signatures, events, since_ns, t_hop_ns, each=True)
