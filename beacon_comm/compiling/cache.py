@@ -42,15 +42,15 @@ def ensure_compiler_cache() -> Path | None:
 def _forget_other_versions(folders: list[Path]) -> None:
     """Delete the kernels that were compiled from other sources than the present ones."""
     sources = sorted(path for room in ROOMS for path in (PACKAGE / room).glob('*.py'))
-    version = hashlib.sha256(b''.join(path.read_bytes() for path in sources)).hexdigest()
+    version = hashlib.sha256(b''.join(path.read_bytes() for path in sources)).digest()
     for folder in folders:
         stamp = folder / 'beacon_comm_kernels'
-        if stamp.is_file() and stamp.read_text() == version:
+        if stamp.is_file() and stamp.read_bytes() == version:
             continue
         for kernel in folder.rglob('*.nb[ic]'):
             with contextlib.suppress(OSError):  # another process was faster
                 kernel.unlink()
-        stamp.write_text(version)
+        stamp.write_bytes(version)
 
 
 def _is_writable(folder: Path) -> bool:
