@@ -175,33 +175,24 @@ def test_a_cache_that_cannot_be_made_is_replaced(tmp_path: Path) -> None:
     blocked = tmp_path / 'a file'
     blocked.write_text('')
     folder = Path(_cache_folder(blocked / 'cache', tmp_path))
-    assert folder.parent == tmp_path and stat.S_IMODE(folder.stat().st_mode) == 0o700
+    assert folder.parent.parent == tmp_path and stat.S_IMODE(folder.parent.stat().st_mode) == 0o700
 
 
-def test_kernels_of_another_version_are_compiled_anew(tmp_path: Path) -> None:
+def test_every_version_has_kernels_of_its_own(tmp_path: Path) -> None:
     """A kernel that was compiled against a type that is gone would keep the node from starting."""
     package = tmp_path / 'beacon_comm'
-    rooms = ('core', 'wire', 'simulation')
-    kernels = [package / room / '__pycache__' / name for room in rooms for name in ('old.nbi', 'old.nbc')]
-
-    def start() -> None:
-        assert _cache_folder(package, tmp_path, given='') == 'None'
-
-    def compile_old() -> None:
-        for kernel in kernels:
-            kernel.parent.mkdir(parents=True, exist_ok=True)
-            kernel.touch()
-
-    compile_old()
-    (package / 'core' / 'stage.py').write_text('LEVEL = 1')
-    start()
-    assert not any(kernel.exists() for kernel in kernels)
-    compile_old()
-    start()
-    assert all(kernel.exists() for kernel in kernels)  # of this version
-    (package / 'core' / 'stage.py').write_text('LEVEL = 2')
-    start()
-    assert not any(kernel.exists() for kernel in kernels)
+    (package / 'core').mkdir(parents=True)
+    (package / 'core' / '.#stage.py').symlink_to('nowhere')
+    folders = []
+    for source in ('LEVEL = 1', 'LEVEL = 1', 'LEVEL = 2'):
+        (package / 'core' / 'stage.py').write_text(source)
+        folders.append(Path(_cache_folder(package, tmp_path, given='')))
+        assert folders[-1].is_dir() and folders[-1].parent == package / '__pycache__'
+    assert folders[0] == folders[1] != folders[2] and not folders[0].exists()
+    # One that is given is kept, and a process's children have the same.
+    given = Path(_cache_folder(package, tmp_path, given=str(tmp_path / 'given')))
+    assert given == tmp_path / 'given' / folders[2].name
+    assert Path(_cache_folder(package, tmp_path, given=str(given))) == given
 
 
 def _cache_folder(cache: Path, temporary: Path, given: str | None = None) -> str:

@@ -1,11 +1,11 @@
-"""A place for the compiled kernels where the usual ones cannot be written, and none of another version there.
+"""A place for the compiled kernels that can be written, and a place of its own for each version of the sources.
 
 numba keeps them in ``NUMBA_CACHE_DIR``, beside the source, or in the user's cache folder, and refuses to *import* a
 cached function where none of the three can be written: a robot that installs to a read-only disk and runs the node as
 a user without a home.  Then they go to the temporary folder.  It has to be called before numba is imported.
 
 Whether a kernel is out of date numba asks of the file alone that it stands in, not of what that imports, and it fails
-where a type that it remembers is gone.  So after any change of the sources all of them are compiled anew.
+where a type that it remembers is gone.  So every version of the sources has a folder of its own, named after them.
 """
 
 from __future__ import annotations
@@ -13,44 +13,49 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import shutil
 import stat
 import tempfile
 from pathlib import Path
 
 PACKAGE = Path(__file__).absolute().parents[1]
 ROOMS = ('core', 'wire', 'simulation')
+_PREFIX = 'beacon_comm_'
 
 
-def ensure_compiler_cache() -> Path | None:
-    """Set ``NUMBA_CACHE_DIR`` where nothing else can be written; return the folder if it was needed."""
+def ensure_compiler_cache() -> Path:
+    """Set ``NUMBA_CACHE_DIR`` to the folder of this version where it can be written; return the folder."""
     given = os.environ.get('NUMBA_CACHE_DIR')
     user = Path(os.environ.get('XDG_CACHE_HOME') or Path('~/.cache').expanduser()) / 'numba'
-    in_tree = [PACKAGE / room / '__pycache__' for room in ROOMS]
-    if given and _is_writable(Path(given)):
-        return None
-    if all(map(_is_writable, in_tree)):
-        _forget_other_versions(in_tree)
-        return None
-    if _is_writable(user):
-        return None
-    folder = _temporary_folder()
-    _forget_other_versions([folder])
+    choices = [Path(given)] if given else []
+    choices = [choice.parent if choice.name.startswith(_PREFIX) else choice for choice in choices]
+    for choice in (*choices, PACKAGE / '__pycache__', user):
+        folder = choice / _version()
+        if _is_writable(folder):
+            break
+    else:
+        folder = _temporary_folder() / _version()
+        folder.mkdir(exist_ok=True)
+    _delete_other_versions(folder)
     os.environ['NUMBA_CACHE_DIR'] = str(folder)
     return folder
 
 
-def _forget_other_versions(folders: list[Path]) -> None:
-    """Delete the kernels that were compiled from other sources than the present ones."""
-    sources = sorted(path for room in ROOMS for path in (PACKAGE / room).glob('*.py'))
-    version = hashlib.sha256(b''.join(path.read_bytes() for path in sources)).digest()
-    for folder in folders:
-        stamp = folder / 'beacon_comm_kernels'
-        if stamp.is_file() and stamp.read_bytes() == version:
-            continue
-        for kernel in folder.rglob('*.nb[ic]'):
-            with contextlib.suppress(OSError):  # another process was faster
-                kernel.unlink()
-        stamp.write_bytes(version)
+def _version() -> str:
+    """Return a name for the present sources."""
+    digest = hashlib.sha256()
+    for path in sorted(path for room in ROOMS for path in (PACKAGE / room).glob('*.py')):
+        with contextlib.suppress(OSError):  # an editor's link to nowhere
+            digest.update(path.read_bytes())
+    return _PREFIX + digest.hexdigest()[:16]
+
+
+def _delete_other_versions(folder: Path) -> None:
+    """Delete the kernels of other versions; a process that still runs one has them in memory."""
+    with contextlib.suppress(OSError):
+        for other in folder.parent.glob(f'{_PREFIX}*'):
+            if other != folder and other.is_dir() and not other.is_symlink():
+                shutil.rmtree(other, ignore_errors=True)
 
 
 def _is_writable(folder: Path) -> bool:
@@ -64,7 +69,7 @@ def _is_writable(folder: Path) -> bool:
 
 def _temporary_folder() -> Path:
     """Return the same folder at every start, so that kernels are compiled once; never one that another user made."""
-    folder = Path(tempfile.gettempdir()) / f'beacon_comm_kernels_{os.getuid()}'
+    folder = Path(tempfile.gettempdir()) / f'{_PREFIX}kernels_{os.getuid()}'
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
         state = folder.lstat()
@@ -72,4 +77,4 @@ def _temporary_folder() -> Path:
             return folder
     except OSError:
         pass
-    return Path(tempfile.mkdtemp(prefix='beacon_comm_kernels_'))
+    return Path(tempfile.mkdtemp(prefix=f'{_PREFIX}kernels_'))
