@@ -412,6 +412,8 @@ class MotionTracker(Tracker):
                     break
             else:
                 for other in tracks:
+                    if other.track_id not in self._tracks:
+                        continue
                     near = math.dist(before.position_at(t_hop_ns), other.position_at(t_hop_ns)) <= other.extent_px + gate
                     if near and not other.quiet and other.bit_rate_bps is None and before.fits(other):
                         self.exchange(track.track_id, other.track_id)

@@ -1,0 +1,46 @@
+"""Tracks at a hop, as their own events have left them."""
+
+from beacon_comm.core import motion
+from beacon_comm.core.motion_tracks import MotionTrack, MotionTracker, Steady
+from beacon_comm.core.parameters import Parameters
+
+T0_NS = 1_000_000_000
+HOP_NS = 10_000_000
+
+
+def track_at(track_id, x_px, speed=0.0, **options):
+    """Return a track that had as many events of its own as usual."""
+    track = MotionTrack(
+        track_id, x_px, 100.0, T0_NS, 4.0, 1.0, 0, T0_NS, matched_ns=T0_NS, origin_ns=T0_NS, **options
+    )  # fmt: skip
+    motion.begin(track.row, 0.0, x_px, 100.0, speed, 0.0, 0.01, 100.0)
+    track.settle()
+    values = {
+        motion.EXTENT: 4.0, motion.HOP_ON: 500.0, motion.HOP_OFF: 500.0, motion.HOP_RR: 8000.0, motion.USUAL: 1e4,
+        motion.LAST: 0.009, motion.TRUST: 1.0,
+    }  # fmt: skip
+    track.row[list(values)] = list(values.values())
+    return track
+
+
+def test_a_track_that_jumped_does_not_return_to_one_that_is_merged_at_that_hop():
+    tracker = MotionTracker(Parameters(), (640, 480))
+    read = track_at(1, 200.0, bit_rate_bps=1000.0)
+    double = track_at(2, 201.0, covered_since_ns=T0_NS - 590_000_000)
+    jumped = track_at(3, 240.0, 1500.0, bit_rate_bps=1000.0, steady=Steady(201.0, 100.0, 0.0, 0.0, T0_NS))
+    for track in (read, double, jumped):
+        tracker._tracks[track.track_id] = track
+    changes = tracker.update([], T0_NS + HOP_NS)
+    assert [track.track_id for track in changes.lost] == [2]
+    assert abs(read.x_px - 200.0) < 1.0 and jumped.x_px > 230.0
+
+
+def test_two_tracks_that_are_exchanged_are_where_the_other_one_was():
+    tracker = MotionTracker(Parameters(), (640, 480))
+    one, other = track_at(1, 200.0, bit_rate_bps=1000.0), track_at(2, 300.0, 50.0, bit_rate_bps=500.0)
+    tracker._tracks.update({1: one, 2: other})
+    tracker.exchange(1, 2)
+    assert (one.x_px, other.x_px) == (300.0, 200.0)
+    assert (one.vx_px_per_s, other.vx_px_per_s) == (50.0, 0.0)
+    assert (one.bit_rate_bps, other.bit_rate_bps) == (1000.0, 500.0)  # what they are stays
+    assert one.row[motion.X] == 300.0 and other.row[motion.X] == 200.0
