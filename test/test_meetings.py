@@ -35,15 +35,15 @@ def between(events, start_ns, stop_ns):
 
 
 class Scene:
-    """Two tracks that meet at MEETS_NS and are apart again at APART_NS, and what each one has the events of."""
+    """Tracks that meet at MEETS_NS and are apart again at APART_NS, and what each one has the events of."""
 
-    def __init__(self, first, second):
-        self.beacons = (first, second)
-        self.signatures = [signature_of(events, MEETS_NS) for events in self.beacons]
-        self.has = {1: first, 2: second}  # by label, after the meeting
+    def __init__(self, *beacons):
+        self.beacons = beacons
+        self.signatures = [signature_of(events, MEETS_NS) for events in beacons]
+        self.has = dict(enumerate(beacons, 1))  # by label, after the meeting
         self.quiet = set()
-        self.began_ns = {1: 0, 2: 0}
-        self.rates = {1: RATE_BPS, 2: RATE_BPS}
+        self.began_ns = dict.fromkeys(self.has, 0)
+        self.rates = dict.fromkeys(self.has, RATE_BPS)
 
     def tracks_at(self, t_ns):
         tracks = {}
@@ -57,14 +57,17 @@ class Scene:
         return tracks
 
     def exchanged(self, to_ns=MEETS_NS + 600_000_000):
-        meetings, found = Meetings(), []
+        meetings, found = Meetings(HOP_NS / NS), []
         for t_ns in range(MEETS_NS - 2 * HOP_NS, to_ns, HOP_NS):
-            found += meetings.exchanged(
+            exchanges = meetings.exchanged(
                 self.tracks_at(t_ns),
                 lambda label: self.signatures[label - 1],
                 lambda label, t_ns=t_ns: between(self.has[label], APART_NS, t_ns),
                 t_ns,
             )
+            for one, other in exchanges:
+                self.has[one], self.has[other] = self.has[other], self.has[one]
+            found += exchanges
         return found
 
 
@@ -101,6 +104,31 @@ def test_beacons_that_have_one_anothers_tracks_get_their_labels_back():
     scene = Scene(beacon(0), beacon(1, 2_300_000))
     scene.has = {1: scene.beacons[1], 2: scene.beacons[0]}
     assert scene.exchanged() == [(1, 2)]
+
+
+def test_three_that_meet_get_their_labels_back():
+    beacons = beacon(0), beacon(1, 2_300_000), beacon(0, 5_600_000)
+    scene = Scene(*beacons)
+    scene.has = {1: beacons[1], 2: beacons[2], 3: beacons[0]}
+    scene.exchanged()
+    assert [scene.has[label] is events for label, events in enumerate(beacons, 1)] == [True] * 3
+
+
+def test_a_meeting_between_two_hops_is_one():
+    scene = Scene(beacon(0), beacon(1, 2_300_000))
+    scene.has = {1: scene.beacons[1], 2: scene.beacons[0]}
+
+    def fast_at(t_ns, apart=lambda t_ns: 4_000.0 * (t_ns - MEETS_NS - HOP_NS // 2) / NS):
+        return {
+            label: Track(
+                label, 300.0 + sign * apart(t_ns), 100.0, t_ns, RADIUS_PX, 1.0, 0, t_ns,
+                vx_px_per_s=sign * 4_000.0, bit_rate_bps=RATE_BPS,
+            )
+            for label, sign in ((1, 1.0), (2, -1.0))
+        }  # fmt: skip
+
+    scene.tracks_at = fast_at
+    assert scene.exchanged(MEETS_NS + 120_000_000) == [(1, 2)]
 
 
 def test_beacons_whose_bits_lie_alike_keep_what_they_have():

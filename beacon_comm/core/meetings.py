@@ -8,7 +8,8 @@
                      near   │ some characters    or log p(1's events | 2) + log p(2's | 1)   they have one another's
 
 Paths alone cannot tell what passes through one another from what turns back.  Where one of the two tracks was thrown off, a
-track that began meanwhile may have its beacon.
+track that began meanwhile may have its beacon.  A signature is good for as long as its clock is sure, about a second: beacons
+that stay near one another for longer keep the labels that their paths give them.
 """
 
 from __future__ import annotations
@@ -47,9 +48,14 @@ class _Meeting:
 
 
 class Meetings:
-    """Finds the labels that are to be exchanged after meetings."""
+    """Finds the labels that are to be exchanged after meetings.
 
-    def __init__(self) -> None:
+    Args:
+        hop_s: from one point of the hop grid to the next (s).
+    """
+
+    def __init__(self, hop_s: float) -> None:
+        self._hop_s = hop_s
         self._meetings: dict[tuple[int, int], _Meeting | None] = {}  # None: nothing can be said of this one
 
     def clear(self) -> None:
@@ -67,7 +73,7 @@ class Meetings:
             backlog: returns a label's buffered events: times (ns, ``(n,)`` int64) and polarities (``(n,)`` int8).
             t_hop_ns: the hop's time (ns).
         """
-        near = _near_pairs([track for track in tracks.values() if track.bit_rate_bps is not None], t_hop_ns)
+        near = _near_pairs([track for track in tracks.values() if track.bit_rate_bps is not None], t_hop_ns, self._hop_s)
         for pair in near:
             meeting = self._meetings.get(pair)
             if meeting is not None:
@@ -75,8 +81,10 @@ class Meetings:
             elif pair not in self._meetings:
                 first, second = (signature(track_id) for track_id in pair)
                 self._meetings[pair] = None if first is None or second is None else _Meeting(t_hop_ns, (first, second))
-        found = []
+        found: list[tuple[int, int]] = []
         for pair, meeting in [entry for entry in self._meetings.items() if entry[0] not in near]:
+            if any(label in pair for labels in found for label in labels):
+                continue  # of three that meet: the next hop has one exchange less to think of
             exchanges: list[tuple[int, int]] | None = []
             if meeting is not None and tracks.keys() >= set(pair):
                 exchanges = _decide(pair, meeting, tracks, backlog, t_hop_ns)
@@ -86,13 +94,20 @@ class Meetings:
         return found
 
 
-def _near_pairs(tracks: list[Track], t_hop_ns: int) -> list[tuple[int, int]]:
-    """Return the labels of those that are near one another."""
+def _differences(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    return vectors[:, None, :] - vectors[None, :, :]
+
+
+def _near_pairs(tracks: list[Track], t_hop_ns: int, hop_s: float) -> list[tuple[int, int]]:
+    """Return the labels of those that are near one another, or were within the hop."""
     if len(tracks) < 2:
         return []
-    x, y = positions_at(tracks, t_hop_ns).T
-    reach = np.array([track.extent_px for track in tracks])
-    distance = np.hypot(x[:, None] - x[None, :], y[:, None] - y[None, :])
+    moving = np.array([(track.vx_px_per_s, track.vy_px_per_s, track.extent_px) for track in tracks])
+    apart = _differences(positions_at(tracks, t_hop_ns))
+    moved = _differences(moving[:, :2]) * hop_s  # within the hop
+    share = np.clip((apart * moved).sum(axis=2) / np.maximum((moved * moved).sum(axis=2), 1e-9), 0.0, 1.0)
+    distance = np.linalg.norm(apart - share[:, :, None] * moved, axis=2)  # when they were nearest
+    reach = moving[:, 2]
     pairs = np.argwhere(np.triu(distance <= reach[:, None] + reach[None, :] + NEAR_PX, 1))
     return [(tracks[i].track_id, tracks[j].track_id) for i, j in pairs]
 

@@ -141,7 +141,7 @@ class Receiver:
         self._t_ns: int | None = None
         self._confirmed: tuple[int, ...] = ()
         self._settled_ns: dict[int, int] = {}
-        self._meetings = Meetings()
+        self._meetings = Meetings(parameters.hop_s) if parameters.tracker == 'motion' else None
 
     def push(self, batch: EventBatch) -> Output:
         """Take the next events; the paper's section III, one call a stage.
@@ -227,6 +227,8 @@ class Receiver:
 
     def _tell_apart(self, t_ns: int) -> None:
         """Give the beacons that have exchanged their tracks their labels back."""
+        if self._meetings is None:
+            return
         detection = self._detection
         for one, other in self._meetings.exchanged(detection.tracks, self._slots.signature, detection.backlog, t_ns):
             detection.exchange(one, other)
@@ -256,7 +258,8 @@ class Receiver:
 
     def _restart(self, changes: TrackChanges) -> Output:
         self._settled_ns = {}
-        self._meetings.clear()
+        if self._meetings is not None:
+            self._meetings.clear()
         characters: list[ReceivedCharacter] = []
         lost: list[BeaconSnapshot] = []
         self._lose(changes, characters, lost)
