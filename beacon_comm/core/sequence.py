@@ -170,7 +170,7 @@ class SequenceDemodulator:
                     break
             elif not self._attempt(t_end):
                 break
-        if len(self._events) > self._forget_at or len(self._gaps) > _MANY_GAPS:
+        if len(self._events) > min(self._forget_at, self._most_events) or len(self._gaps) > _MANY_GAPS:
             self._forget(t_end)
             self._forget_at = max(2 * len(self._events), _FEW_EVENTS)
         self._known_to = t_end
@@ -342,7 +342,9 @@ class SequenceDemodulator:
 
     def _attempt_all(self) -> None:
         """Make a last attempt at every rate: the stream ends, and a short message may still wait for the slower ones."""
-        first, stop = int(np.searchsorted(self._t, self._usable_from)), len(self._t)
+        stop = len(self._t)
+        usable_from = max(self._usable_from, self._known_to - self._longest)
+        first = max(int(np.searchsorted(self._t, usable_from)), stop - self._most_events)
         locks = []
         for search in self._searches:
             window = search.window(self._t, float(self._t[-1]), first, stop)
