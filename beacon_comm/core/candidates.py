@@ -275,9 +275,11 @@ class CandidateSlots:
         return None if slot is None else slot.demodulator.bit_rate_std_bps
 
     def signature(self, track_id: int) -> Signature | None:
-        """Return how the beacon of a track can be known again, None while it is not read or the receiver cannot say."""
+        """Return how a confirmed beacon can be known again; None: it is none, or it is not read, or the receiver cannot say."""
         slot = self._slots.get(track_id)
-        return slot.demodulator.signature() if slot is not None and isinstance(slot.demodulator, Recognising) else None
+        if slot is None or not slot.record.confirmed or not isinstance(slot.demodulator, Recognising):
+            return None
+        return slot.demodulator.signature()
 
     def confirmed_at_ns(self, track_id: int) -> int | None:
         """Return the end of the character that confirmed a track (ns), None if it is not confirmed."""

@@ -302,7 +302,7 @@ def _wake(clock, state, layout, gaps, t):  # type: ignore[no-untyped-def]
 def explain(clocks, states, layouts, inverted, t, polarity, start, stop):  # type: ignore[no-untyped-def]
     """Return how likely events are (log p, nat) to be those of a locked signal, in the bits between two times.
 
-    The clock only predicts, and nothing is learnt.
+    The clock only predicts, and nothing is learnt.  How many events there are does not count: another track may have a share.
 
     Args:
         clocks, states, layouts, inverted: see :func:`detect`; of the signal some time before, changed in place.
@@ -324,6 +324,8 @@ def explain(clocks, states, layouts, inverted, t, polarity, start, stop):  # typ
     clock.frozen, state.bit = True, MEMORY_BITS
     gaps, total = np.empty((0, 2)), 0.0
     i = np.searchsorted(t, clock.border)
+    bits = max((stop - clock.border) / clock.period, 1.0)
+    state.gain = max((np.searchsorted(t, stop) - i) / bits / state.means.mean(), 1e-3)
     while clock.border + clock.period <= stop:
         i = take_events(clock, t, polarity, i, -1 if inverted else 1, False)
         total += framed_step(layout, state.metric, state.fresh, state.source, _weigh_bit(clock, state, gaps))

@@ -1,7 +1,7 @@
 """The signature of a beacon that is being read: when its bits and characters begin, and what they look like.
 
-It tells whether other events are of the same beacon: where they lie in its bits, in which places of the frame, and how many
-they are, each bit weighed by what was learnt of it before (:func:`beacon_comm.core.sequence_detection.explain`).
+It tells whether other events are of the same beacon: where they lie in its bits, and in which places of the frame, each bit
+weighed by what was learnt of it before (:func:`beacon_comm.core.sequence_detection.explain`).
 """
 
 from __future__ import annotations
