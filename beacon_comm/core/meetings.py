@@ -30,13 +30,12 @@ Backlog = Callable[[int], Events]
 NEAR_PX = 2.0
 """Two tracks are near where no more than this lies between their circles (px)."""
 
-SETTLING_CHARACTERS, DECIDING_CHARACTERS, PATIENT_CHARACTERS = 1, 4, 20
+SETTLING_CHARACTERS, DECIDING_CHARACTERS, PATIENT_CHARACTERS = 2, 5, 20
 """Tracks that are apart settle for so many characters; it is decided after so many, or later, up to so many."""
 
-MARGIN, MARGIN_SHARE, EACH_SHARE = 12.0, 0.02, 0.08
+MARGIN, MARGIN_SHARE = 12.0, 0.1
 """By so much likelier (nat) one way has to be than the other, and by this share of the log p of both: bits that lie elsewhere
-cost several times as much, and beacons whose bits lie alike cannot be told by how well they fit.  Where a track is new, and
-may be any light, by the second share for either track."""
+cost 15 % and more, and beacons whose bits lie alike cannot be told by how well they fit."""
 
 
 @dataclass(slots=True)
@@ -157,7 +156,6 @@ def _have_exchanged(
     gains = [(other_2 - own_1, own_1 + other_2), (other_1 - own_2, other_1 + own_2)]  # of each track's events
     if not each:
         gains = [(gains[0][0] + gains[1][0], gains[0][1] + gains[1][1])]
-    share = EACH_SHARE if each else MARGIN_SHARE
-    clear = [abs(gain) >= max(MARGIN, -share * both) for gain, both in gains]
+    clear = [abs(gain) >= max(MARGIN, -MARGIN_SHARE * both) for gain, both in gains]
     exchanged = {gain > 0.0 for gain, _ in gains}
     return exchanged.pop() if all(clear) and len(exchanged) == 1 else None
