@@ -189,6 +189,10 @@ class Listener:
     def hear(self, count: int, replay: 'Replay') -> None:
         """Listen until ``count`` messages are there, or the replay has ended."""
         self.spin_until(lambda: len(self.received) >= count or replay.ended())
+        heard = -1
+        while heard < len(self.received) < count:  # what is on its way when the replay has ended
+            heard, until_s = len(self.received), time.monotonic() + 0.5
+            self.spin_until(lambda until_s=until_s: time.monotonic() > until_s)
 
     def close(self) -> None:
         self._executor.shutdown()
