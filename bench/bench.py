@@ -153,7 +153,7 @@ def chain(folder: Path) -> MetricTable:
             print_chain(stream, rate, threshold, receiver, run)
         if not key:
             part = cdrs[:60]
-            run = run_chain(part, size, replace(parameters, receiver='threshold'), ReferenceDetector)
+            run = run_chain(part, size, replace(parameters, receiver='threshold', tracker='nearest'), ReferenceDetector)
             by_numpy = mev_per_s(run.events, run.total_s - run.decode_s + numpy_decode_s(part, size))
             metrics['numpy_reference_mev_per_s'] = by_numpy
             metrics['evt3_to_characters_over_numpy_ratio'] = metrics['evt3_to_characters_mev_per_s'] / by_numpy
