@@ -12,8 +12,10 @@ import pytest
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'bench'))
 
 from live import Phase, Repeated, measure  # noqa: E402
-from streams import LOOP_NS, START_NS, make_stream  # noqa: E402
+from streams import LOOP_NS, START_NS, make_stream, messages  # noqa: E402
 
+import bench  # noqa: E402
+from beacon_comm.core.parameters import Parameters  # noqa: E402
 from beacon_comm.wire.stream import EventStream  # noqa: E402
 from bench import live_metrics  # noqa: E402
 
@@ -60,3 +62,8 @@ def test_the_live_part_runs(data_folder: Path) -> None:
     assert 0 < phase.measured <= phase.packets
     assert 0.0 < phase.offered_mev_per_s <= phase.scene_mev_per_s * 1.1
     assert phase.shed > 0 or phase.events_mev_per_s > 0.0
+
+
+def test_the_numpy_reference_runs_with_the_default_parameters(data_folder: Path) -> None:
+    stream = make_stream(data_folder, bench.VGA, 1e6, 0.1)
+    assert bench.numpy_mev_per_s(list(messages(stream, 'evt3')), bench.VGA, Parameters()) > 0.0
