@@ -183,12 +183,16 @@ def test_every_version_has_kernels_of_its_own(tmp_path: Path) -> None:
     package = tmp_path / 'beacon_comm'
     (package / 'core').mkdir(parents=True)
     (package / 'core' / '.#stage.py').symlink_to('nowhere')
+    workspaces = [package / '__pycache__' / name for name in ('beacon_comm_ws', 'beacon_comm_kernels_1000')]
+    for workspace in workspaces:
+        workspace.mkdir(parents=True)
     folders = []
     for source in ('LEVEL = 1', 'LEVEL = 1', 'LEVEL = 2'):
         (package / 'core' / 'stage.py').write_text(source)
         folders.append(Path(_cache_folder(package, tmp_path, given='')))
         assert folders[-1].is_dir() and folders[-1].parent == package / '__pycache__'
     assert folders[0] == folders[1] != folders[2] and not folders[0].exists()
+    assert all(workspace.is_dir() for workspace in workspaces)  # somebody's, whatever the name begins with
     # One that is given is kept, and a process's children have the same.
     given = Path(_cache_folder(package, tmp_path, given=str(tmp_path / 'given')))
     assert given == tmp_path / 'given' / folders[2].name

@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import re
 import shutil
 import stat
 import tempfile
@@ -20,7 +21,8 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).absolute().parents[1]
 ROOMS = ('core', 'wire', 'simulation')
-_PREFIX = 'beacon_comm_'
+_PREFIX = 'beacon_comm_kernels_'
+_A_VERSION = re.compile(_PREFIX + '[0-9a-f]{16}')  # other folders are somebody's, and stay
 
 
 def ensure_compiler_cache() -> Path:
@@ -28,13 +30,14 @@ def ensure_compiler_cache() -> Path:
     given = os.environ.get('NUMBA_CACHE_DIR')
     user = Path(os.environ.get('XDG_CACHE_HOME') or Path('~/.cache').expanduser()) / 'numba'
     choices = [Path(given)] if given else []
-    choices = [choice.parent if choice.name.startswith(_PREFIX) else choice for choice in choices]
+    choices = [choice.parent if _A_VERSION.fullmatch(choice.name) else choice for choice in choices]
+    version = _version()
     for choice in (*choices, PACKAGE / '__pycache__', user):
-        folder = choice / _version()
+        folder = choice / version
         if _is_writable(folder):
             break
     else:
-        folder = _temporary_folder() / _version()
+        folder = _temporary_folder() / version
         folder.mkdir(exist_ok=True)
     _delete_other_versions(folder)
     os.environ['NUMBA_CACHE_DIR'] = str(folder)
@@ -54,7 +57,7 @@ def _delete_other_versions(folder: Path) -> None:
     """Delete the kernels of other versions; a process that still runs one has them in memory."""
     with contextlib.suppress(OSError):
         for other in folder.parent.glob(f'{_PREFIX}*'):
-            if other != folder and other.is_dir() and not other.is_symlink():
+            if other != folder and _A_VERSION.fullmatch(other.name) and other.is_dir() and not other.is_symlink():
                 shutil.rmtree(other, ignore_errors=True)
 
 
@@ -69,7 +72,7 @@ def _is_writable(folder: Path) -> bool:
 
 def _temporary_folder() -> Path:
     """Return the same folder at every start, so that kernels are compiled once; never one that another user made."""
-    folder = Path(tempfile.gettempdir()) / f'{_PREFIX}kernels_{os.getuid()}'
+    folder = Path(tempfile.gettempdir()) / f'{_PREFIX}{os.getuid()}'
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
         state = folder.lstat()
@@ -77,4 +80,4 @@ def _temporary_folder() -> Path:
             return folder
     except OSError:
         pass
-    return Path(tempfile.mkdtemp(prefix=f'{_PREFIX}kernels_'))
+    return Path(tempfile.mkdtemp(prefix=_PREFIX))
