@@ -48,15 +48,14 @@ class EventArrays:
         """View of the polarities, ``(n,)`` of ±1; good until events are appended."""
         return self._polarity[self._start : self._stop]
 
-    def append(self, times: NDArray[Any], polarity: NDArray[np.int8], origin: int = 0) -> None:
-        """Copy events to the end, their times from ``origin`` on; they must not be older than those before."""
-        stop = self._stop + len(times)
-        if stop > len(self._times):
-            self._make_room(len(times))
-            stop = self._stop + len(times)
-        self._times[self._stop : stop] = times - origin if origin else times
-        self._polarity[self._stop : stop] = polarity
-        self._stop = stop
+    def append(self, times: NDArray[Any], polarity: NDArray[np.int8]) -> None:
+        """Copy events to the end; they must not be older than those before."""
+        n = len(times)
+        if self._stop + n > len(self._times):
+            self._make_room(n)
+        self._times[self._stop : self._stop + n] = times
+        self._polarity[self._stop : self._stop + n] = polarity
+        self._stop += n
 
     def drop(self, count: int) -> None:
         """Let the first events go."""

@@ -153,7 +153,7 @@ class SequenceDemodulator:
                 self.share(*self._shared)
             self._restart(0.0 if self._searched_to_ns is None else max(0.0, float(self._searched_to_ns - self._origin_ns)))
         self._ended = None
-        self._events.append(t_ns, polarity, self._origin_ns)
+        self._events.append(t_ns - self._origin_ns, polarity)
         t_end = float(t_end_ns - self._origin_ns)
         if len(t_ns):
             for search in self._searches:
