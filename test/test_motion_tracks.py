@@ -1,5 +1,7 @@
 """Tracks at a hop, as their own events have left them."""
 
+import pytest
+
 from beacon_comm.core import motion
 from beacon_comm.core.motion_tracks import MotionTrack, MotionTracker, Steady
 from beacon_comm.core.parameters import Parameters
@@ -27,7 +29,7 @@ def test_a_track_that_jumped_does_not_return_to_one_that_is_merged_at_that_hop()
     tracker = MotionTracker(Parameters(), (640, 480))
     read = track_at(1, 200.0, bit_rate_bps=1000.0)
     double = track_at(2, 201.0, covered_since_ns=T0_NS - 590_000_000)
-    jumped = track_at(3, 240.0, 1500.0, bit_rate_bps=1000.0, steady=Steady(201.0, 100.0, 0.0, 0.0, T0_NS))
+    jumped = track_at(3, 240.0, 1500.0, bit_rate_bps=1000.0, steady=Steady(201.0, 100.0, 0.0, 0.0, 4.0, T0_NS))
     for track in (read, double, jumped):
         tracker._tracks[track.track_id] = track
     changes = tracker.update([], T0_NS + HOP_NS)
@@ -44,3 +46,16 @@ def test_two_tracks_that_are_exchanged_are_where_the_other_one_was():
     assert (one.vx_px_per_s, other.vx_px_per_s) == (50.0, 0.0)
     assert (one.bit_rate_bps, other.bit_rate_bps) == (1000.0, 500.0)  # what they are stays
     assert one.row[motion.X] == 300.0 and other.row[motion.X] == 200.0
+
+
+@pytest.mark.parametrize(('extent_px', 'moves'), [(4.0, True), (60.0, False)])
+def test_a_track_that_jumped_goes_on_in_one_that_moves_as_it_did_and_is_of_about_its_size(extent_px, moves):
+    tracker = MotionTracker(Parameters(), (640, 480))
+    jumped = track_at(1, 240.0, 1500.0, bit_rate_bps=1000.0, steady=Steady(201.0, 100.0, 0.0, 0.0, 4.0, T0_NS))
+    other = track_at(2, 202.0)
+    other.extent_px = other.row[motion.EXTENT] = extent_px
+    other.row[motion.HOP_RR] *= (extent_px / 4.0) ** 2
+    for track in (jumped, other):
+        tracker._tracks[track.track_id] = track
+    tracker.update([], T0_NS + HOP_NS)
+    assert (abs(jumped.x_px - 202.0) < 2.0) == moves

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from beacon_comm.core import motion
 from beacon_comm.core.association import assign
-from beacon_comm.core.blobs import Blob
+from beacon_comm.core.blobs import SPREAD_EVENTS, Blob
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.index_image import whole_hops
 from beacon_comm.core.motion import (
@@ -64,7 +64,6 @@ from beacon_comm.core.tracks import (
 
 _FEWEST_EVENTS = 4
 _SEEN_SHARE = 0.1  # of the usual events of a hop: fewer are the background's
-_SPREAD_EVENTS = 30  # fewer say nothing about the extent
 _EXTENT_MOVED = 0.2
 _LEAST_EXTENT_PX = 0.5
 _USUAL_GAIN = 0.1
@@ -80,6 +79,7 @@ _AT_REST, _MOVING_PER_PX_PER_S = 0.75, 0.95e-3
 _LEAST_SHARE = 0.1
 _JUMP_PX_PER_S, _JUMP_SHARE = 300.0, 0.3  # a velocity jumps by more than so much and this share of it …
 _JUMPED_S = 0.1  # … and what was before is remembered for so long
+_LIKE_EXTENT = 4.0  # what is so many times as large is something else
 _GRAIN_PX = 0.022  # a spot's centroid is off by so much because its pixels differ
 _GRAIN_SPEED_PX_PER_S = 50.0  # at this speed half of that is averaged out: a pixel in the filter's memory
 _LATENCY_SHARE = 0.25  # of the latency is its standard deviation
@@ -87,12 +87,13 @@ _LATENCY_SHARE = 0.25  # of the latency is its standard deviation
 
 @dataclass(frozen=True, slots=True)
 class Steady:
-    """Where a track was when its velocity was last steady: centre (px) and velocity (px/s) at a time (ns)."""
+    """Where a track was when its velocity was last steady: centre (px), velocity (px/s) and radius (px) at a time (ns)."""
 
     x_px: float
     y_px: float
     vx_px_per_s: float
     vy_px_per_s: float
+    extent_px: float
     t_ns: int
 
     def position_at(self, t_ns: int) -> tuple[float, float]:
@@ -101,7 +102,9 @@ class Steady:
         return self.x_px + self.vx_px_per_s * dt, self.y_px + self.vy_px_per_s * dt
 
     def fits(self, track: Track) -> bool:
-        """Return whether a track moves much like it."""
+        """Return whether a track moves much like it, and is of about its size."""
+        if track.extent_px > _LIKE_EXTENT * self.extent_px:
+            return False
         jump = math.hypot(track.vx_px_per_s - self.vx_px_per_s, track.vy_px_per_s - self.vy_px_per_s)
         return jump <= _JUMP_PX_PER_S + _JUMP_SHARE * math.hypot(self.vx_px_per_s, self.vy_px_per_s)
 
@@ -191,11 +194,12 @@ class MotionTrack(Track):
         return None if before.fits(self) else before
 
     def return_to(self, x_px: float, y_px: float, t_ns: int, variance_px2: float, before: Steady) -> None:
-        """Be at a place again at ``t_ns`` (ns), with the velocity from before the jump."""
+        """Be at a place again at ``t_ns`` (ns), with the velocity and the size from before the jump."""
         vx, vy = before.vx_px_per_s, before.vy_px_per_s
         motion.begin(self.row, (t_ns - self.origin_ns) / NS_PER_S, x_px, y_px, vx, vy, variance_px2, _JUMP_PX_PER_S**2)
         self.settle()
-        self.steady = Steady(x_px, y_px, vx, vy, t_ns)
+        self.extent_px = before.extent_px
+        self.steady = Steady(x_px, y_px, vx, vy, before.extent_px, t_ns)
 
     def stop(self, x_px: float, y_px: float, t_ns: int) -> None:
         """Wait at a place from ``t_ns`` (ns) on."""
@@ -339,7 +343,7 @@ class MotionTracker(Tracker):
             track.last_seen_ns = track.origin_ns + round(float(track.row[LAST]) * NS_PER_S)
             track.row[USUAL] += _USUAL_GAIN * (own / hop_s - track.row[USUAL])
         gain = EXTENT_RISE if extent > track.extent_px else EXTENT_FALL
-        if seen and own >= _SPREAD_EVENTS and spread < extent:
+        if seen and own >= SPREAD_EVENTS and spread < extent:
             extent = spread
             gain = EXTENT_RISE if extent > track.extent_px else _EXTENT_MOVED
         track.extent_px = max(_LEAST_EXTENT_PX, track.extent_px + gain * (extent - track.extent_px))
@@ -402,7 +406,7 @@ class MotionTracker(Tracker):
             before = track.jumped(t_hop_ns)
             if before is None:
                 here = track.position_at(t_hop_ns)
-                track.steady = Steady(*here, track.vx_px_per_s, track.vy_px_per_s, t_hop_ns)
+                track.steady = Steady(*here, track.vx_px_per_s, track.vy_px_per_s, track.extent_px, t_hop_ns)
                 continue
             for entry in left:
                 blob = blobs[entry[1]]
@@ -428,7 +432,7 @@ class MotionTracker(Tracker):
         older.last_seen_ns, older.matched_ns, older.quiet = younger.last_seen_ns, younger.matched_ns, False
 
     def _may_begin(self, blob: Blob) -> bool:
-        return blob.fresh
+        return blob.fresh and super()._may_begin(blob)
 
     def _make(self, track_id: int, blob: Blob, t_hop_ns: int, tried_ns: int | None) -> Track:
         track = MotionTrack(
