@@ -1,11 +1,14 @@
 """Association, labels, prediction, quiet and lost tracks, from blobs made by hand."""
 
+import dataclasses
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from beacon_comm.core.blobs import Blob
+from beacon_comm.core.blobs import SPREAD_EVENTS, Blob
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.tracks import Track, Tracker
 
@@ -15,7 +18,8 @@ SIZE = (640, 480)
 
 
 def blob(x, y, t_ns, index=2.0, extent=4.0, fresh=True, events=1000):
-    return Blob(x, y, t_ns, extent, index, events, 49, events // 2 if fresh else 0, fresh, 0)
+    area = round(math.pi * extent**2)
+    return Blob(x, y, t_ns, extent, index, events, area, events // 2 if fresh else 0, fresh, 0)
 
 
 def follow(tracker, path, hops, start=0, **shape):
@@ -270,3 +274,14 @@ def test_more_lamps_than_tracks_take_turns_and_a_weak_beacon_too():
             turns.append(round(queue[0].x_px))
     assert set(turns[:8]) == {50, 100, 150, 200, 250, 300, 400}
     assert min(turns.count(x) for x in set(turns)) >= 3
+
+
+def test_edges_of_a_texture_that_touch_one_another_are_no_light():
+    tracker = Tracker(Parameters(), SIZE)
+    tracker.update([blob(50, 50, T0_NS)], T0_NS)
+    web = Blob(53.0, 50.0, T0_NS + HOP_NS, 30.0, 2.0, 1000, 300, 500, True, 0)  # a tenth of its disc
+    changes = tracker.update([web], T0_NS + HOP_NS)
+    assert not changes.new
+    assert tracker.tracks[1].quiet and tracker.tracks[1].extent_px == 4.0
+    few = dataclasses.replace(web, x_px=90.0, fresh_count=SPREAD_EVENTS - 1)  # too few to know their spread
+    assert len(tracker.update([few], T0_NS + 2 * HOP_NS).new) == 1

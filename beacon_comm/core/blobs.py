@@ -17,6 +17,7 @@ too, if they are spread less than all events on the blob's pixels, which a movin
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,7 +46,7 @@ from beacon_comm.core.parameters import Parameters
 
 _FRESH_EVENTS = 4  # fewer new events say nothing about the position …
 _FRESH_SHARE = 0.1  # … nor does less than this share of its mean: a held LED in front of a moving background
-_SPREAD_EVENTS = 30  # fewer new events say nothing about the extent
+SPREAD_EVENTS = 30  # fewer events say nothing about the extent
 AS_ACTIVE = 0.5  # share of the events a pixel that makes another pixel "about as active"
 
 
@@ -81,6 +82,13 @@ class Blob:
     def variance_px2(self) -> float:
         """Variance of the centre (px²), one axis: that of the mean of events spread over a disc."""
         return self.extent_px**2 / (4.0 * max(1, self.fresh_count if self.fresh else self.event_count))
+
+    def fills(self, share: float) -> bool:
+        """Return whether its pixels are at least this share of the disc with the spread of its events, as far as that is known.
+
+        A light does, even one that moves: its newest events are together.  Edges of a texture that touch one another do not.
+        """
+        return not self.fresh or self.fresh_count < SPREAD_EVENTS or self.area_px >= share * math.pi * self.extent_px**2
 
 
 class BlobFinder:
@@ -160,7 +168,7 @@ class BlobFinder:
         new_t = t_hop_ns - self._hop_ns + sum_t // np.maximum(n, 1)
         t_ns = np.where(fresh, new_t, t_hop_ns - length * self._hop_ns // 2)
         x, y = np.where(fresh, new_x, x), np.where(fresh, new_y, y)
-        extent = np.where(fresh & (n >= _SPREAD_EVENTS), np.minimum(extent, spread), extent)
+        extent = np.where(fresh & (n >= SPREAD_EVENTS), np.minimum(extent, spread), extent)
         columns = (x, y, t_ns, extent, index, sums[:, COUNT], sums[:, AREA], n, fresh, window)
         return [Blob(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
 

@@ -212,6 +212,9 @@ class Parameters(Declared):
     event_latency_s: float = parameter(
         130e-6, 'motion: events come so long after the light; a moving beacon is ahead of them', 's', 0.0, 0.01
     )
+    min_fill: float = parameter(
+        0.2, 'a blob that fills less of the disc with the spread of its events is texture, no light', '', 0.0, 1.0
+    )
     association_gate_px: float = parameter(12.0, 'largest distance of a blob from the predicted centre', 'px', 0.1)
     gate_growth_px_per_s: float = parameter(40.0, 'growth of the gate while a track is unseen', 'px/s', 0.0)
     max_gate_px: float = parameter(40.0, 'largest gate', 'px', 0.1)
