@@ -3,6 +3,7 @@
 import pytest
 
 from beacon_comm.core import motion
+from beacon_comm.core.blobs import Blob
 from beacon_comm.core.motion_tracks import MotionTrack, MotionTracker, Steady
 from beacon_comm.core.parameters import Parameters
 
@@ -59,3 +60,44 @@ def test_a_track_that_jumped_goes_on_in_one_that_moves_as_it_did_and_is_of_about
         tracker._tracks[track.track_id] = track
     tracker.update([], T0_NS + HOP_NS)
     assert (abs(jumped.x_px - 202.0) < 2.0) == moves
+
+
+def hops(tracker, count):
+    """Give the tracker hops without blobs, each track's events as they were in the first; return the labels lost."""
+    lost = []
+    rows = {track_id: track.row.copy() for track_id, track in tracker.tracks.items()}
+    for k in range(1, count + 1):
+        for track_id, track in tracker.tracks.items():
+            track.row[motion.HOP_OFF : motion.LAST] = rows[track_id][motion.HOP_OFF : motion.LAST]
+        lost += [track.track_id for track in tracker.update([], T0_NS + k * HOP_NS).lost]
+    return lost
+
+
+@pytest.mark.parametrize(
+    ('rates', 'lost'),
+    [((None, None), [2]), ((1000.0, None), [2]), ((None, 1000.0), [1]), ((1000.0, 1000.0), [])],
+)
+def test_a_double_that_nobody_has_read_ends_before_it_is_read(rates, lost):
+    tracker = MotionTracker(Parameters(), (640, 480))
+    for track_id, rate in zip((1, 2), rates, strict=True):
+        tracker._tracks[track_id] = track_at(track_id, 200.0 + track_id, bit_rate_bps=rate)
+    assert hops(tracker, 4) == lost
+
+
+@pytest.mark.parametrize(('rate', 'goes_on'), [(None, True), (1001.0, True), (2000.0, False)])
+def test_a_quiet_track_goes_on_in_a_younger_one_there_unless_that_sends_at_another_rate(rate, goes_on):
+    tracker = MotionTracker(Parameters(), (640, 480))
+    quiet = track_at(1, 203.0, bit_rate_bps=1000.0)
+    quiet.row[motion.HOP_OFF] = quiet.row[motion.HOP_ON] = 0.0
+    tracker._tracks.update({1: quiet, 2: track_at(2, 200.0, bit_rate_bps=rate)})
+    tracker.update([], T0_NS + HOP_NS)
+    assert (not quiet.quiet and abs(quiet.x_px - 200.0) < 1.0) == goes_on
+
+
+@pytest.mark.parametrize(('rate', 'grown_px'), [(None, 22.0), (1000.0, 5.8)])
+def test_what_is_read_does_not_grow_at_once(rate, grown_px):
+    tracker = MotionTracker(Parameters(), (640, 480))
+    track = tracker._tracks[1] = track_at(1, 200.0, bit_rate_bps=rate)
+    track.row[motion.HOP_RR] = 0.5 * 1000.0 * 50.0**2  # all over a disc of 50 px
+    tracker.update([Blob(200.0, 100.0, T0_NS + HOP_NS // 2, 40.0, 1.0, 2000, 5000, 1000, True, 0)], T0_NS + HOP_NS)
+    assert track.extent_px == pytest.approx(grown_px)

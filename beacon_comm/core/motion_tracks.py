@@ -54,6 +54,7 @@ from beacon_comm.core.tracks import (
     EXTENT_RISE,
     FIRST_SPEED_PX_PER_S,
     FLOOR_PX,
+    SAME_RATE,
     SURPRISE,
     Covariance,
     Track,
@@ -70,6 +71,7 @@ _USUAL_GAIN = 0.1
 _HIDDEN_SHARE = 0.5  # of its radius a track moves in a hop before its events are hidden from the windows
 _HIDDEN_AFTER_HOPS = 2
 _SAME_EXTENTS = 1.1  # two tracks of one blob are half a disc's centroids apart: 0.85 radii
+_MERGE_UNREAD_S = 0.03  # a double that nobody has read yet has nothing to lose: before both are read
 # What is told of the error, calibrated on simulated scenes (docs/tracking.py, the part "errors").  Errors to the other side
 # cancel for longer than one observation; a prediction is better than the likely modes' accelerations say; a moving light's
 # edges, its turns and the readout row by row add what grows with the speed.
@@ -107,6 +109,17 @@ class Steady:
             return False
         jump = math.hypot(track.vx_px_per_s - self.vx_px_per_s, track.vy_px_per_s - self.vy_px_per_s)
         return jump <= _JUMP_PX_PER_S + _JUMP_SHARE * math.hypot(self.vx_px_per_s, self.vy_px_per_s)
+
+
+def _is_unread(track: Track) -> bool:
+    """Return whether nobody has read a track yet, nor the one whose label it has taken."""
+    return track.bit_rate_bps is None and track.claimed_bps is None
+
+
+def _may_be_same(one: Track, other: Track) -> bool:
+    """Return whether two tracks may be of one beacon: not if both bit rates are known, and are different."""
+    rates = one.bit_rate_bps, other.bit_rate_bps
+    return rates[0] is None or rates[1] is None or abs(rates[1] / rates[0] - 1.0) <= SAME_RATE
 
 
 @dataclass(slots=True)
@@ -215,6 +228,7 @@ class MotionTracker(Tracker):
         long = whole_hops(parameters.long_window_bits * parameters.slowest_bit_s, parameters.hop_s)
         self._forget = np.array([1.0 - 1.0 / short] * 2 + [1.0 - 1.0 / max(short, long)] * 2)
         self._reacquire_ns = round(parameters.reacquire_s * NS_PER_S)
+        self._merge_unread_ns = round(min(_MERGE_UNREAD_S, parameters.merge_after_s) * NS_PER_S)
         self._remembered: dict[int, MotionTrack] = {}
         self._disowned: list[int] = []
         self._least_index = parameters.index_threshold * parameters.index_grow_share
@@ -342,10 +356,11 @@ class MotionTracker(Tracker):
         if seen:
             track.last_seen_ns = track.origin_ns + round(float(track.row[LAST]) * NS_PER_S)
             track.row[USUAL] += _USUAL_GAIN * (own / hop_s - track.row[USUAL])
-        gain = EXTENT_RISE if extent > track.extent_px else EXTENT_FALL
+        rise = EXTENT_RISE if track.bit_rate_bps is None else EXTENT_FALL  # what is read grows as it comes nearer, no faster
+        gain = rise if extent > track.extent_px else EXTENT_FALL
         if seen and own >= SPREAD_EVENTS and spread < extent:
             extent = spread
-            gain = EXTENT_RISE if extent > track.extent_px else _EXTENT_MOVED
+            gain = rise if extent > track.extent_px else _EXTENT_MOVED
         track.extent_px = max(_LEAST_EXTENT_PX, track.extent_px + gain * (extent - track.extent_px))
         track.quiet = False
         track.matched_ns = t_hop_ns
@@ -366,8 +381,16 @@ class MotionTracker(Tracker):
             blob_of[i], track_of[j] = j, i
         return blob_of, track_of
 
+    def _ended(self, track: Track, t_hop_ns: int) -> bool:
+        since = track.covered_since_ns
+        covered_ns = 0 if since is None else t_hop_ns - since
+        return super()._ended(track, t_hop_ns) or (_is_unread(track) and covered_ns >= self._merge_unread_ns)
+
     def _find_doubles(self, tracks: list[MotionTrack], t_hop_ns: int) -> None:
-        """Find the tracks that an older one has the events of, or that share its blob, and since when."""
+        """Find the tracks that another one has the events of, or that share its blob, and since when.
+
+        Of two that are read, or of two that are not, the younger is the double; else the one that is not.
+        """
         if len(tracks) < 2:
             for track in tracks:
                 track.covered_since_ns = None
@@ -375,6 +398,7 @@ class MotionTracker(Tracker):
         centre = positions_at(tracks, t_hop_ns)
         extent = np.array([track.extent_px for track in tracks])
         quiet = np.array([track.quiet for track in tracks])
+        unread = np.array([_is_unread(track) for track in tracks])
         distance = np.hypot(*(centre[:, None, :] - centre[None, :, :]).transpose(2, 0, 1))
         near = distance < _SAME_EXTENTS * np.minimum(extent[:, None], extent[None, :])
         near |= (distance < extent[None, :]) & quiet[:, None] & ~quiet[None, :]
@@ -384,11 +408,12 @@ class MotionTracker(Tracker):
             if not some[i]:
                 track.covered_since_ns = None
                 continue
-            older = np.flatnonzero(near[i, :i])
-            covered = len(older[~quiet[older]]) > 0
+            rivals = np.flatnonzero(near[i] & ~quiet)
+            covered = bool(np.any((unread[rivals] < unread[i]) | ((unread[rivals] == unread[i]) & (rivals < i))))
             younger = np.flatnonzero(near[i, i + 1 :] & quiet[i] & ~quiet[i + 1 :]) + i + 1
-            if not covered and len(younger):
-                self._take_over(track, tracks[younger[0]])
+            same = [k for k in younger if _may_be_same(track, tracks[k])]
+            if not covered and same:
+                self._take_over(track, tracks[same[0]])
                 quiet[i] = False
             if not covered:
                 track.covered_since_ns = None
@@ -418,7 +443,8 @@ class MotionTracker(Tracker):
                 for other in tracks:
                     if other.track_id not in self._tracks:
                         continue
-                    near = math.dist(before.position_at(t_hop_ns), other.position_at(t_hop_ns)) <= other.extent_px + gate
+                    reach = min(other.extent_px, before.extent_px) + gate
+                    near = math.dist(before.position_at(t_hop_ns), other.position_at(t_hop_ns)) <= reach
                     if near and not other.quiet and other.bit_rate_bps is None and before.fits(other):
                         self.exchange(track.track_id, other.track_id)
                         break

@@ -40,6 +40,7 @@ FIRST_SPEED_PX_PER_S = 200.0  # standard deviation of an unknown velocity
 _KNOWN_AFTER_NS = 100_000_000  # a velocity seen for less long is not gone on with
 FLOOR_PX = 0.05  # an observation is never better than this
 SURPRISE = 16.0  # an innovation of more than 4 standard deviations is a manoeuvre
+SAME_RATE = 0.02  # the same beacon's bit rates differ by less
 _NEVER = -(1 << 63)
 Covariance = tuple[tuple[float, float], tuple[float, float]]
 """((xx, xy), (xy, yy))."""
