@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 
 import pytest
-from live_session import MS, PACKET_NS, START_NS, TEXT, Heard, Session, beacon_events, packets, spared
+from live_session import BIT_RATE, MS, PACKET_NS, START_NS, TEXT, TYPE, Heard, Session, beacon_events, packets, spared
 
 from beacon_comm.ros.overload import Shedder
 from beacon_comm.ros.report import Report
@@ -105,3 +105,20 @@ def test_the_report_tells_of_what_was_shed() -> None:
     traffic, events, values = report.look(session.live, 0)
     assert (traffic.messages, traffic.shed, events) == (1, 1, 0)
     assert values['shed_packets'] == 1 and values['lag_s'] == '0.0120'
+
+
+def test_while_messages_are_shed_less_is_spent_on_searching_and_as_much_as_before_a_second_later() -> None:
+    session = Session(bit_rates=(504.0, BIT_RATE))
+    stream = packets(beacon_events(5 * TEXT))
+    session.push(stream[:20])
+    slots = session.live._receiver._slots  # type: ignore[union-attr]
+    assert slots.search_share == 1.0
+    session.live.shed(session.now_ns)
+    session.push(stream[21:100])
+    assert slots.search_share == 0.1
+    session.push(stream[100:250])
+    assert slots.search_share == 1.0
+    session.live.shed(session.now_ns)
+    session.live.open(TYPE, session.now_ns)  # another stream, whose time has nothing to do with this one's
+    session.push(stream[:2])
+    assert slots.search_share == 1.0

@@ -149,6 +149,9 @@ class CandidateSlots:
     Args:
         parameters: see "Candidate slots" of :class:`Parameters`.
         make_demodulator: called once for each slot that is given.
+
+    Attributes:
+        search_share: share of ``search_load`` that may be spent from the next hop on.
     """
 
     def __init__(self, parameters: Parameters, make_demodulator: Callable[[Parameters], Demodulator]) -> None:
@@ -158,6 +161,7 @@ class CandidateSlots:
         self._tried: dict[int, _Tried] = {}
         self._slots_full = False
         self._gaps = Gaps(2 * buffer_length_ns(parameters))
+        self.search_share = 1.0
 
     def miss(self, start_ns: int, stop_ns: int) -> None:
         """Hear that the events of the stream from ``start_ns``, up to which it is known, to ``stop_ns`` (ns) are missing."""
@@ -326,7 +330,7 @@ class CandidateSlots:
             for slot in self._slots.values()
             if isinstance(slot.demodulator, Searching) and slot.demodulator.bit_rate_bps is None
         ]
-        load = self._p.search_load / max(1, len(searching) + more)
+        load = self.search_share * self._p.search_load / max(1, len(searching) + more)
         for demodulator in searching:
             demodulator.share(load, t_ns)
         return load

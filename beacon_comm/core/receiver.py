@@ -176,6 +176,10 @@ class Receiver:
         self._t_ns = None
         return output
 
+    def search_less(self, share: float) -> None:
+        """Spend only this share of ``search_load`` on looking for bit rates from the next hop on; 1: all of it again."""
+        self._slots.search_share = share
+
     def set_camera(self, camera: CameraModel | None) -> None:
         """Take another calibration from now on."""
         self._camera = camera

@@ -26,6 +26,10 @@ from beacon_comm.ros.stamped import Instant, StampedCharacter
 from beacon_comm.ros.stream_time import StreamTime
 from beacon_comm.wire.stream import Decoded, EventStream
 
+_HURRIED_SHARE, _HURRIED_NS = 0.1, NS_PER_S
+"""What is left of ``search_load`` while messages are shed, and until so much of the stream (ns) has been read without: searches
+that are cut by the next gap begin again, and would keep the node too slow for ever."""
+
 
 @dataclass(frozen=True, slots=True)
 class Step:
@@ -73,6 +77,7 @@ class LiveReceiver:
         self._past_counts: Counter[str] = Counter()
         self._receiver: Receiver | None = None
         self._time = StreamTime(silent_after_ns, lag_ns)
+        self._shed_ns: int | None = None  # the stream's time when messages were shed
         self._clock_map = ClockMap()
         self._gathered: list[StampedCharacter] = []
         self._due_ns: list[int] = []
@@ -127,6 +132,7 @@ class LiveReceiver:
             receiver = self._follow(decoded)
             self._tie(decoded, decoded.batch, now_ns)
             self._gather(receiver.push(self._time.admit(decoded.batch, now_ns)))
+            self._calm_down(receiver)
         return self._step(now_ns, decoded)
 
     def shed(self, now_ns: int) -> None:
@@ -134,6 +140,9 @@ class LiveReceiver:
         if self._stream is not None:
             self._stream.shed()
         self._time.hear(now_ns)
+        if self._receiver is not None:
+            self._shed_ns = self._receiver.t_ns
+            self._receiver.search_less(_HURRIED_SHARE)
 
     def messages_lost(self) -> None:
         """Hear from the middleware that messages were lost."""
@@ -202,6 +211,12 @@ class LiveReceiver:
             self.sensor_size = size
             self._fit_camera()
         return self._receiver
+
+    def _calm_down(self, receiver: Receiver) -> None:
+        """Search for bit rates as before once no message has been shed for a while."""
+        if self._shed_ns is not None and receiver.t_ns is not None and not 0 <= receiver.t_ns - self._shed_ns < _HURRIED_NS:
+            self._shed_ns = None
+            receiver.search_less(1.0)
 
     def _fit_camera(self) -> None:
         """Give the receiver the calibration if it is of a sensor of this size; another one's bearings would be wrong."""
