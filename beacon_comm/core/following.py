@@ -89,7 +89,8 @@ _BALANCE = 0.2  # a share of ON events so much unlike the usual one is a burst o
 _SMALL_LEAD = 1.0  # … worth waiting for the other one where it is off by more than this, over the variance, …
 _MOST_EVENTS = 4000  # … for no more than so many events …
 _LONGEST_WAIT_S = 4e-3  # … and no longer than this
-_SHORTEST_S = 1e-4  # a burst is read out row by row: its first events are of the upper rows
+_SHORTEST_S = 1e-4  # a burst is read out row by row, its first events are of the upper rows: an observation is of no less …
+_SHORTEST_PX = 6.0  # … and of as many times that as its radius is larger than this, for the more rows it has
 _GROWTH_PX = 12.0  # a circle grows by no more than this
 _SLACK_PX = 3.0  # a path may change by this within a step before the cells are listed again
 _LEAST_SPREAD_PX2 = 0.1  # variance of the events of a single pixel, and more
@@ -320,7 +321,8 @@ def _update(row, doubt, at_once):  # type: ignore[no-untyped-def]
     off, on = sums[0], sums[4]
     n = off + on
     age_s = row[LAST] - row[SINCE]
-    if age_s < _SHORTEST_S and n < _MOST_EVENTS and not at_once:
+    shortest_s = _SHORTEST_S * max(1.0, row[EXTENT] / _SHORTEST_PX)
+    if age_s < shortest_s and n < _MOST_EVENTS and not at_once:
         return False
     if n < _FEWEST_USUAL * row[USUAL] * max(age_s, _LEAST_SPAN_S):  # a few of the background's, while it is dark
         if at_once or n >= 2 * UPDATE_EVENTS or age_s > _LONGEST_WAIT_S:
