@@ -2,7 +2,7 @@
 """Measure tracking on simulated scenes: speed, crossings, many beacons, occlusion, a shaken camera, and the errors' truth.
 
     python docs/tracking.py --write            # docs/tracking.md and its figure; some minutes
-    python docs/tracking.py --full --write     # at least 1000 characters a point and 100 runs; an hour
+    python docs/tracking.py --full --write     # at least 1000 characters a point and 100 runs; over an hour
     python docs/tracking.py --only crossings --runs 100
 
 ::
@@ -250,11 +250,11 @@ def cross(seed: int, near: bool, tracker: str) -> str:
 
 def crossings(full: bool, runs: int | None = None) -> dict[str, Any]:
     """Labels kept where two beacons pass one another."""
-    runs = runs or (100 if full else 20)
     found: dict[str, Any] = {}
     for tracker in TRACKERS:
         for near in (False, True):
-            seeds = range(runs if tracker == 'motion' else max(runs // 5, 5))
+            count = runs or ((1000 if near else 100) if full else 20)
+            seeds = range(count if tracker == 'motion' else max(min(count, 100) // 5, 5))
             ends = [cross(seed, near, tracker) for seed in tqdm(seeds, desc=f'crossings, {tracker}')]
             counts = {end: ends.count(end) for end in ('kept', 'swapped', 'lost')}
             found[f'{"3 radii" if near else "20 radii"} {tracker}'] = counts
@@ -440,7 +440,7 @@ def _shown(value: Any) -> str:
 
 HEAD = """# Tracking
 
-Written by `python docs/tracking.py --write` (each part by the command below its title; all of them take an hour with `--full`)
+Written by `python docs/tracking.py --write` (each part by the command below its title; all take over an hour with `--full`)
 on simulated scenes ([docs/simulator.md](simulator.md)): 640 × 480, beacons of 1 kbps, default parameters with the rate listed.
 `motion` follows tracks by their own events ([following.py](../beacon_comm/core/following.py),
 [motion.py](../beacon_comm/core/motion.py), [motion_tracks.py](../beacon_comm/core/motion_tracks.py)) and is the default;
