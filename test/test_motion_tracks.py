@@ -74,13 +74,17 @@ def hops(tracker, count):
 
 
 @pytest.mark.parametrize(
-    ('rates', 'lost'),
-    [((None, None), [2]), ((1000.0, None), [2]), ((None, 1000.0), [1]), ((1000.0, 1000.0), [])],
-)
-def test_a_double_that_nobody_has_read_ends_before_it_is_read(rates, lost):
+    ('rates', 'age_s', 'lost'),
+    [
+        ((None, None), 0.05, [2]), ((1000.0, None), 0.05, [2]), ((None, 1000.0), 0.05, [1]), ((1000.0, 1000.0), 0.05, []),
+        ((None, None), 0.5, []), ((1000.0, None), 0.5, []),
+    ],
+)  # fmt: skip
+def test_a_new_double_that_nobody_has_read_ends_before_it_is_read(rates, age_s, lost):
     tracker = MotionTracker(Parameters(), (640, 480))
     for track_id, rate in zip((1, 2), rates, strict=True):
-        tracker._tracks[track_id] = track_at(track_id, 200.0 + track_id, bit_rate_bps=rate)
+        track = tracker._tracks[track_id] = track_at(track_id, 200.0 + track_id, bit_rate_bps=rate)
+        track.first_seen_ns = T0_NS - round(age_s * 1e9)
     assert hops(tracker, 4) == lost
 
 
@@ -101,3 +105,24 @@ def test_what_is_read_does_not_grow_at_once(rate, grown_px):
     track.row[motion.HOP_RR] = 0.5 * 1000.0 * 50.0**2  # all over a disc of 50 px
     tracker.update([Blob(200.0, 100.0, T0_NS + HOP_NS // 2, 40.0, 1.0, 2000, 5000, 1000, True, 0)], T0_NS + HOP_NS)
     assert track.extent_px == pytest.approx(grown_px)
+
+
+def test_a_track_that_was_thrown_off_and_sees_nothing_waits_where_it_would_be():
+    tracker = MotionTracker(Parameters(), (640, 480))
+    thrown = track_at(1, 240.0, 9000.0, bit_rate_bps=1000.0, steady=Steady(201.0, 100.0, 50.0, 0.0, 5.0, T0_NS))
+    thrown.row[motion.HOP_OFF] = thrown.row[motion.HOP_ON] = 0.0
+    tracker._tracks[1] = thrown
+    tracker.update([], T0_NS + HOP_NS)
+    assert thrown.quiet
+    assert thrown.position_at(T0_NS + 2 * HOP_NS) == pytest.approx((202.0, 100.0), abs=0.1)
+
+
+def test_a_beacon_that_went_on_in_another_track_is_known_where_it_is_now():
+    tracker = MotionTracker(Parameters(), (640, 480))
+    jumped = track_at(1, 240.0, 1500.0, bit_rate_bps=1000.0, steady=Steady(201.0, 100.0, 0.0, 0.0, 4.0, T0_NS))
+    other = track_at(2, 202.0)
+    for track in (jumped, other):
+        tracker._tracks[track.track_id] = track
+    tracker.update([], T0_NS + HOP_NS)
+    assert jumped.steady is not None and abs(jumped.steady.x_px - 202.0) < 2.0
+    assert other.steady is None

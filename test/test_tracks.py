@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beacon_comm.core.blobs import SPREAD_EVENTS, Blob
+from beacon_comm.core.motion_tracks import MotionTracker
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.tracks import Track, Tracker
 
@@ -277,11 +278,18 @@ def test_more_lamps_than_tracks_take_turns_and_a_weak_beacon_too():
 
 
 def test_edges_of_a_texture_that_touch_one_another_are_no_light():
-    tracker = Tracker(Parameters(), SIZE)
+    tracker = MotionTracker(Parameters(), SIZE)
     tracker.update([blob(50, 50, T0_NS)], T0_NS)
-    web = Blob(53.0, 50.0, T0_NS + HOP_NS, 30.0, 2.0, 1000, 300, 500, True, 0)  # a tenth of its disc
+    web = Blob(53.0, 50.0, T0_NS + HOP_NS, 30.0, 2.0, 1000, 150, 500, True, 0)  # a twentieth of its disc
     changes = tracker.update([web], T0_NS + HOP_NS)
     assert not changes.new
     assert tracker.tracks[1].quiet and tracker.tracks[1].extent_px == 4.0
     few = dataclasses.replace(web, x_px=90.0, fresh_count=SPREAD_EVENTS - 1)  # too few to know their spread
     assert len(tracker.update([few], T0_NS + 2 * HOP_NS).new) == 1
+    nearest = Tracker(Parameters(), SIZE)  # the paper's looks at no shape
+    assert len(nearest.update([web], T0_NS + HOP_NS).new) == 1
+
+
+def test_a_ring_light_begins_a_track():
+    ring = Blob(50.0, 50.0, T0_NS, 28.0, 2.0, 1000, round(math.pi * (21.5**2 - 18.5**2)), 500, True, 0)
+    assert len(MotionTracker(Parameters(), SIZE).update([ring], T0_NS).new) == 1

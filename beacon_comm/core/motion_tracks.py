@@ -71,7 +71,8 @@ _USUAL_GAIN = 0.1
 _HIDDEN_SHARE = 0.5  # of its radius a track moves in a hop before its events are hidden from the windows
 _HIDDEN_AFTER_HOPS = 2
 _SAME_EXTENTS = 1.1  # two tracks of one blob are half a disc's centroids apart: 0.85 radii
-_MERGE_UNREAD_S = 0.03  # a double that nobody has read yet has nothing to lose: before both are read
+_MERGE_UNREAD_S = 0.03  # a double that nobody has read yet has nothing to lose: before both are read …
+_NEW_S = 0.2  # … if it was a double soon after it began: what comes by later is another light
 # What is told of the error, calibrated on simulated scenes (docs/tracking.py, the part "errors").  Errors to the other side
 # cancel for longer than one observation; a prediction is better than the likely modes' accelerations say; a moving light's
 # edges, its turns and the readout row by row add what grows with the speed.
@@ -102,6 +103,11 @@ class Steady:
         """Return where it would be at ``t_ns`` (ns)."""
         dt = (t_ns - self.t_ns) / NS_PER_S
         return self.x_px + self.vx_px_per_s * dt, self.y_px + self.vy_px_per_s * dt
+
+    @classmethod
+    def of(cls, track: Track, t_ns: int) -> Steady:
+        """Return where a track is at ``t_ns`` (ns)."""
+        return cls(*track.position_at(t_ns), track.vx_px_per_s, track.vy_px_per_s, track.extent_px, t_ns)
 
     def fits(self, track: Track) -> bool:
         """Return whether a track moves much like it, and is of about its size."""
@@ -382,9 +388,12 @@ class MotionTracker(Tracker):
         return blob_of, track_of
 
     def _ended(self, track: Track, t_hop_ns: int) -> bool:
+        if super()._ended(track, t_hop_ns):
+            return True
         since = track.covered_since_ns
-        covered_ns = 0 if since is None else t_hop_ns - since
-        return super()._ended(track, t_hop_ns) or (_is_unread(track) and covered_ns >= self._merge_unread_ns)
+        if since is None or not _is_unread(track):
+            return False
+        return since - track.first_seen_ns < _NEW_S * NS_PER_S and t_hop_ns - since >= self._merge_unread_ns
 
     def _find_doubles(self, tracks: list[MotionTrack], t_hop_ns: int) -> None:
         """Find the tracks that another one has the events of, or that share its blob, and since when.
@@ -430,8 +439,8 @@ class MotionTracker(Tracker):
                 continue
             before = track.jumped(t_hop_ns)
             if before is None:
-                here = track.position_at(t_hop_ns)
-                track.steady = Steady(*here, track.vx_px_per_s, track.vy_px_per_s, track.extent_px, t_hop_ns)
+                if not track.quiet:
+                    track.steady = Steady.of(track, t_hop_ns)
                 continue
             for entry in left:
                 blob = blobs[entry[1]]
@@ -447,7 +456,12 @@ class MotionTracker(Tracker):
                     near = math.dist(before.position_at(t_hop_ns), other.position_at(t_hop_ns)) <= reach
                     if near and not other.quiet and other.bit_rate_bps is None and before.fits(other):
                         self.exchange(track.track_id, other.track_id)
+                        track.steady, other.steady = Steady.of(track, t_hop_ns), None
                         break
+                else:
+                    x, y = before.position_at(t_hop_ns)
+                    if track.quiet and 0.0 <= x < self._sensor_size[0] and 0.0 <= y < self._sensor_size[1]:
+                        track.return_to(x, y, t_hop_ns, gate**2, before)  # what dragged it away is gone
         return left
 
     def _take_over(self, older: MotionTrack, younger: MotionTrack) -> None:
@@ -459,6 +473,9 @@ class MotionTracker(Tracker):
 
     def _may_begin(self, blob: Blob) -> bool:
         return blob.fresh and super()._may_begin(blob)
+
+    def _is_light(self, blob: Blob) -> bool:
+        return blob.fills(self._parameters.min_fill)
 
     def _make(self, track_id: int, blob: Blob, t_hop_ns: int, tried_ns: int | None) -> Track:
         track = MotionTrack(

@@ -213,8 +213,9 @@ class Parameters(Declared):
         130e-6, 'motion: events come so long after the light; a moving beacon is ahead of them', 's', 0.0, 0.01
     )
     min_fill: float = parameter(
-        0.2, 'a blob that fills less of the disc with the spread of its events is texture, no light', '', 0.0, 1.0
-    )
+        0.1, 'motion: what fills less of the disc with its spread is edges, no light (0: thin rings are lights, too)',
+        '', 0.0, 1.0,
+    )  # fmt: skip
     association_gate_px: float = parameter(12.0, 'largest distance of a blob from the predicted centre', 'px', 0.1)
     gate_growth_px_per_s: float = parameter(40.0, 'growth of the gate while a track is unseen', 'px/s', 0.0)
     max_gate_px: float = parameter(40.0, 'largest gate', 'px', 0.1)

@@ -273,7 +273,7 @@ class Tracker:
         state = np.column_stack((centre, moving[:, :2], gate))
         seen = np.array([(blob.x_px, blob.y_px, (t_hop_ns - blob.t_ns) / NS_PER_S) for blob in blobs])
         first, second, distance2 = _pairs(state, seen)
-        light = np.array([blob.fills(p.min_fill) for blob in blobs])[second]
+        light = np.array([self._is_light(blob) for blob in blobs])[second]
         return first[light], second[light], distance2[light]
 
     def _keep_on_sensor(self, track: Track, t_hop_ns: int) -> None:
@@ -343,7 +343,11 @@ class Tracker:
 
     def _may_begin(self, blob: Blob) -> bool:
         """Return whether a track may begin with a blob."""
-        return blob.fills(self._parameters.min_fill)
+        return self._is_light(blob)
+
+    def _is_light(self, blob: Blob) -> bool:
+        """Return whether a blob may be a light at all."""
+        return True
 
     def _new_track(self, blob: Blob, t_hop_ns: int, tried_ns: int) -> Track:
         track = self._make(self._next_id, blob, t_hop_ns, None if tried_ns == _NEVER else tried_ns)
