@@ -121,7 +121,7 @@ def test_a_recorded_background_is_mixed_in(scene: Path, tmp_path: Path, capsys) 
         (SCENE.replace('30, 30]', '3, 30]'), [], 'scene.yaml: beacons[0].path.from_px = [3.0, 30.0]: x must lie in'),
         ('beacons: [', [], 'scene.yaml: no YAML (while parsing'),
         (SCENE, ['--duration', '-2'], '--duration -2: duration_s = -2.0: must lie in'),
-        (SCENE.replace('"Hello, robot. "', 'absent.txt'), [], 'absent.txt: no such file'),
+        (SCENE.replace('"Hello, robot. "', 'absent.txt'), [], 'scene.yaml: beacons: text: absent.txt: no such file'),
         (SCENE, ['--format', 'raw'], "argument --format: invalid choice: 'raw'"),
         (SCENE, ['--output', '{tmp}'], 'exists already, nothing is overwritten'),
         (None, [], 'scene.yaml: no such file, nor one of the scenes circle, crossing'),
@@ -135,6 +135,23 @@ def test_errors_are_one_line_and_exit_code_2(content, arguments, reason, scene: 
         code = leaving.code
     printed = capsys.readouterr()
     assert code == 2 and reason in printed.err and printed.err.count('\n') == 1
+
+
+def test_a_text_file_lies_beside_the_scene_and_the_bag_is_called_as_that(scene: Path, tmp_path: Path, monkeypatch) -> None:
+    scene.write_text(SCENE.replace('"Hello, robot. "', 'words.txt'))
+    (scene.parent / 'words.txt').write_text('robots')
+    elsewhere = tmp_path / 'elsewhere'
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    assert main([str(scene), '--duration', '0.05']) == 0
+    assert read_truth(elsewhere / scene.stem).beacons[0].text == 'robots'
+
+
+def test_a_beacon_that_is_never_in_sight_is_told_of(scene: Path, tmp_path: Path, capsys) -> None:
+    still = 'duration_s: 0.02\nbeacons: [{path: {kind: still, at_px: [9999, 20]}}, {path: {kind: still, at_px: [50, 20]}}]\n'
+    scene.write_text(still)
+    assert main([str(scene), '--output', str(tmp_path / 'bag')]) == 0
+    assert capsys.readouterr().err.count('beacon 1 is never in sight') == 1
 
 
 @pytest.mark.parametrize('path', SCENES, ids=lambda path: path.stem)

@@ -253,6 +253,7 @@ def test_recorded_events_are_mixed_in() -> None:
         ([], 'the file = []: must be a mapping of keys'),
         ({'beacon': []}, 'beacon: no such key; there are duration_s, beacons'),
         ({'duration_s': 'long'}, "duration_s = 'long': must be a number"),
+        ({'beacons': [{'bit_rate_bps': [504, 1000]}]}, 'beacons[0].bit_rate_bps = [504.0, 1000.0]: more rates than beacons'),
         ({'duration_s': 0}, 'duration_s = 0: must lie in [0.001, 86400]'),
         ({'beacons': {}}, 'beacons = {}: must be a list'),
         ({'beacons': [{}, {'path': 3}]}, 'beacons[1].path = 3: must be a mapping with kind: still | line'),

@@ -27,6 +27,7 @@ EVENT_TOPIC = '/event_camera/events'
 PACKET_S = 0.004
 CAMERA_NAME = 'camera.yaml'
 EXIT_INTERRUPTED = 130
+_LOOKS = 1001  # so many times it is looked whether a beacon is in sight
 FORMATS = {'evt3': 'event_camera_msgs/msg/EventPacket'} | {
     package: f'{package}/msg/EventArray' for package in ('dvs_msgs', 'prophesee_event_msgs', 'dv_ros2_msgs')
 }
@@ -52,7 +53,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add('scene', nargs='?', metavar='SCENE', help="a scene's YAML file, or the name of one of the package's own")
-    add('--output', type=Path, metavar='BAG', help='folder to write; must not exist')
+    add('--output', type=Path, metavar='BAG', help="folder to write; must not exist (default: the scene's name, here)")
     add('--seed', type=int, default=0, help='of everything random: the same seed, the same bytes (default 0)')
     add('--duration', type=float, metavar='S', help="instead of the scene's duration_s")
     add('--format', choices=tuple(FORMATS), default='evt3', help='EventPacket in evt3, or the EventArray of a package')
@@ -70,8 +71,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         for path in own_scenes().values():
             print(f'{path.stem:20} {_first_comment(path)}')
         return EXIT_OK
-    if options.scene is None or options.output is None:
-        parser.error('SCENE and --output are required')
+    if options.scene is None:
+        parser.error('SCENE is required')
+    if options.output is None:
+        options.output = Path(Path(options.scene).stem)
     try:
         _simulate(options)
     except BeaconCommError as error:
@@ -129,11 +132,17 @@ def _read(options: argparse.Namespace) -> _Scene:
     from beacon_comm.simulation.description import make_description, read_description
 
     path = scene_path(options.scene)
-    description, content = read_description(path, load_truth)
+
+    def load_text(name: str) -> str:
+        """Return a beacon's text: a file's is looked for beside the scene first."""
+        beside = path.parent / name
+        return load_truth(str(beside) if name.endswith('.txt') and os.path.isfile(beside) else name)
+
+    description, content = read_description(path, load_text)
     if options.duration is not None:
         content = {**content, 'duration_s': options.duration}
         try:
-            description = make_description(content, load_truth)
+            description = make_description(content, load_text)
         except ParameterError as error:
             raise ParameterError(f'--duration {options.duration:g}: {error}') from error
     return _Scene(path, description, content)
@@ -158,6 +167,8 @@ def _background(scene: _Scene) -> Iterator[EventBatch] | None:
 def _simulate(options: argparse.Namespace) -> None:
     scene = _read(options)
     # Imported here: --help and errors in the file need no compiled loops.
+    import numpy as np
+
     from beacon_comm.cli.progress import progress
     from beacon_comm.recordings.bag_writer import BagWriter
     from beacon_comm.recordings.packets import PacketMaker
@@ -198,6 +209,10 @@ def _simulate(options: argparse.Namespace) -> None:
         f' {len(truth.beacons)} beacons, {len(truth.distractors)} distractors',
         file=sys.stderr,
     )
+    looks_ns = np.linspace(0, round(truth.duration_s * 1e9), _LOOKS).astype(np.int64)
+    for beacon in truth.beacons:
+        if not beacon.visible(looks_ns).any():
+            print(f'{NAME}: {scene.path}: {beacon.name} is never in sight', file=sys.stderr)
     if stopped is not None:
         raise stopped
 

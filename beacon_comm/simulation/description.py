@@ -229,7 +229,7 @@ class BeaconKeys:
     """One beacon, or ``count`` alike on a grid."""
 
     path: PathKind | None = key(part_of_kind(PATHS), '', 'where it moves; default: still, in the middle or on the grid', None)
-    text: str = key(words, '', 'what it sends, over and over: sonnet18, a text file or the text itself', DEFAULT_TEXT)
+    text: str = key(words, '', 'what it sends, over and over: sonnet18, a .txt file or the text itself', DEFAULT_TEXT)
     name: str = key(words, '', 'what the truth calls it; default: beacon 1, beacon 2, …', '')
     bit_rate_bps: tuple[float, ...] = key(
         number_or_list(None), 'bit/s', 'its bit rate; a list: for beacons on a grid in turn', (1000.0,), low=1, high=20_000
@@ -261,6 +261,8 @@ class BeaconKeys:
     def __post_init__(self) -> None:
         if self.count > 1 and self.path is not None:
             raise ParameterError('path: several beacons (count) have their places on a grid')
+        if len(self.bit_rate_bps) > self.count:
+            raise ParameterError(f'bit_rate_bps = {list(self.bit_rate_bps)}: more rates than beacons (count: {self.count})')
         if self.shown_s is not None and self.shown_s[1] <= self.shown_s[0]:
             raise ParameterError(f'shown_s = {list(self.shown_s)}: must be a begin and a later end')
         try:
@@ -423,6 +425,8 @@ def read_description(
         return make_description(content, load_text), content
     except ParameterError as error:
         raise ParameterError(f'{path}: {error}') from error
+    except RecordingError as error:
+        raise RecordingError(f'{path}: beacons: text: {error}') from error
 
 
 _TITLES = {
