@@ -526,6 +526,8 @@ def page(
         f' for {LONGEST_S:g} s or to its end, {FEWEST} characters at least, after {LEAD_IN_S:g} s of its end that do not'
         f' count, {LEAD_IN} characters at least; one run a point.',
         markdown_table(columns, statement_rows(points)),
+        'Nothing reads 10 kbps whole here, where an edge of the LED and the pixels is several bits long: the sequence receiver'
+        ' never locks, the threshold receiver gets a part of the characters when it is near.',
         '## Control voltage against filtered events, 4 kHz (simulated)',
         '![Control voltage, filtered events, events and binarised line](figures/paper_control_voltage.png)',
         f'An LED on a 4 kHz square wave at {100 * SQUARE_M:g} cm, the filter at 8000 bit/s: the binarised line is'

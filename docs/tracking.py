@@ -112,7 +112,7 @@ def wilson(right: int, of: int) -> tuple[float, float]:
         return 0.0, 1.0
     z, p = 1.96, right / of
     middle, half = p + z * z / (2 * of), z * math.sqrt(p * (1 - p) / of + z * z / (4 * of * of))
-    return (middle - half) / (1 + z * z / of), min((middle + half) / (1 + z * z / of), 1.0)
+    return max((middle - half) / (1 + z * z / of), 0.0), min((middle + half) / (1 + z * z / of), 1.0)
 
 
 def score(
@@ -416,6 +416,8 @@ def table(columns: list[str], rows: list[list[Any]]) -> str:
 def page(found: dict[str, Any]) -> str:
     """Return ``docs/tracking.md``."""
     parts, commands = [HEAD], found.get('commands', {})
+    if all(name in found for name in PARTS):
+        parts += ['## What was asked for\n', reached(found), LIMITS]
     if 'speeds' in found:
         keys = dict.fromkeys(key.rsplit(' ', 1)[0] for key in found['speeds'])
         rows = [[key, *(Score(*found['speeds'][f'{key} {tracker}']).text() for tracker in TRACKERS)] for key in keys]
@@ -434,6 +436,42 @@ def page(found: dict[str, Any]) -> str:
     return '\n'.join(parts)
 
 
+def reached(found: dict[str, Any]) -> str:
+    """Return the table of what was asked for, and what the parts say of it."""
+
+    def fastest(kind: str) -> str:
+        points = {k: v for k, v in found['speeds'].items() if k.startswith(kind) and 'motion' in k}
+        shares = {int(k.split()[1]): v[0] / max(v[1], 1) for k, v in points.items()}
+        below = [speed for speed, share in sorted(shares.items()) if share < 0.99]
+        best = max((speed for speed in shares if not below or speed < below[0]), default=0)
+        return f'{kind} {best:,} px/s'
+
+    def of(part: str, word: str) -> dict[str, Any]:
+        return {key: value for key, value in found[part].items() if word in key}
+
+    crossed = {key: value for key, value in of('crossings', 'motion').items() if '3 radii' in key}
+    at_once = [int(key.split()[0]) for key, value in of('many', 'motion').items() if value['least'] >= 0.99]
+    waits = found['confirmed']
+    errors = {name: value['rms error (px)'] for name, value in found['errors'].items()}
+    consistency = [value['NEES over its expectation'] for value in found['errors'].values()]
+    rows = [
+        ['characters ≥ 99 % right up to', '2,000 px/s', '5,000 px/s', f'{fastest("line")}, {fastest("circle")}'],
+        ['beacons at once, each ≥ 99 %', '32', '64', str(max(at_once))],
+        ['crossings from 3 radii, labels kept', '100 of 100', '1,000 of 1,000',
+         ', '.join(f'{one["kept"]} of {sum(one.values())}' for one in crossed.values())],
+        ['hidden for 100 ms (aim: 20 ms): characters missed at most', '3', '3',
+         ', '.join(f'{value["characters missed, most"]} ({key})' for key, value in found['hidden'].items())],
+        ['shaken texture, right of sent', '≥ 99 % at 10 Mev/s', '20 Mev/s',
+         '; '.join(f'{key}: {value[0]} of {value[1]}' for key, value in found['shaken'].items() if not key.startswith('2 '))],
+        ['rms error at rest and at 1,000 px/s', '0.2 and 0.5 px', '0.1 and 0.3 px',
+         ', '.join(f'{name}: {value:.2g} px' for name, value in errors.items() if 'still' in name or '1000' in name)],
+        ['NEES over its expectation', '0.9 to 1.1', '', f'{min(consistency):.3g} to {max(consistency):.3g}'],
+        ['first character to confirmed', '0.2 s listed, 0.3 s blind', '',
+         ', '.join(f'{name}: {value["longest (s)"]:.3g} s at most' for name, value in waits.items())],
+    ]  # fmt: skip
+    return table(['', 'asked for', 'aim', 'measured'], rows)
+
+
 def _shown(value: Any) -> str:
     return f'{value:.3g}' if isinstance(value, float) else str(value)
 
@@ -445,6 +483,10 @@ on simulated scenes ([docs/simulator.md](simulator.md)): 640 × 480, beacons of 
 `motion` follows tracks by their own events ([following.py](../beacon_comm/core/following.py),
 [motion.py](../beacon_comm/core/motion.py), [motion_tracks.py](../beacon_comm/core/motion_tracks.py)) and is the default;
 `nearest` is the paper's.
+"""
+LIMITS = """Two beacons, or a beacon and a lamp, whose middles are nearer than some 2.7 radii are one blob and one track, and
+nothing is read while they are.  A light that moves before or behind a beacon may take its track along; if the beacon is
+to be seen again within 0.1 s where it would be, it gets its label back, else a new one.
 """
 SPEEDS = """Slow until locked, then ramped up to the speed; a straight line that turns back at the borders, scored from 10 ms
 after each turn, and a circle of 200 px radius. In parentheses: 95 % intervals (Wilson).
