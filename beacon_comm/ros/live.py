@@ -140,7 +140,7 @@ class LiveReceiver:
         if self._stream is not None:
             self._stream.shed()
         self._time.hear(now_ns)
-        if self._receiver is not None:
+        if self._receiver is not None and self._receiver.t_ns is not None:
             self._shed_ns = self._receiver.t_ns
             self._receiver.search_less(_HURRIED_SHARE)
 
