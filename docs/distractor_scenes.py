@@ -254,18 +254,20 @@ def main() -> None:
     count = options.count or (FULL_COUNT if options.full else DEFAULT_COUNT)
     jobs = [(name, number) for number in range(count) for name in names]
     found = dict.fromkeys(names, Count())
+    interrupted = ''
     with ProcessPoolExecutor(options.processes) as pool:
         results = [(name, pool.submit(watch, name, number, options.seed, options.seconds, folder)) for name, number in jobs]
         try:
             for name, result in tqdm(results, desc='scenes'):
                 found[name] += result.result()
         except KeyboardInterrupt:  # the page of what is counted so far
-            pool.shutdown(cancel_futures=True)
+            pool.shutdown(wait=False, cancel_futures=True)
+            interrupted = f'  # stopped after {sum(count.scenes for count in found.values())} of {len(jobs)} scenes'
     shown = ['--full'] if options.full else []
     for option in ('count', 'seconds', 'seed'):
         if getattr(options, option) != parser.get_default(option):
             shown.append(f'--{option} {getattr(options, option):g}')
-    page = text_of(found, ' '.join(['python docs/distractor_scenes.py', *shown]))
+    page = text_of(found, ' '.join(['python docs/distractor_scenes.py', *shown]) + interrupted)
     if options.output is not None:
         options.output.write_text(page)
     else:
