@@ -381,6 +381,14 @@ def test_a_blurred_beacon_is_confirmed_all_the_same() -> None:
         assert record.confirmed, text
 
 
+def test_edges_that_lie_anywhere_confirm_nothing() -> None:
+    """What was once confirmed of half a screen had a spread of 0.24."""
+    for spread, confirmed in ((0.21, True), (0.24, False)):
+        record = ParityRecord(Parameters())
+        verdicts(record, (replace(character, edge_spread=spread) for character in characters(TEXT * 3)))
+        assert record.confirmed is confirmed
+
+
 def test_equal_share_of_pairs() -> None:
     assert equal_share([1, 1, 1]) == 1.0
     assert equal_share([1, 1, 2, 2]) == pytest.approx(2 / 6)

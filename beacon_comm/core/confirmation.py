@@ -215,7 +215,10 @@ class ParityRecord:
         frames = [counted.frame for counted in vouching]
         if regular_share(frames, self._layout.length) > p.confirm_regular:
             return True
-        if median(counted.edge_spread for counted in vouching) > p.confirm_edge_spread:
+        spread = median(counted.edge_spread for counted in vouching)
+        if spread > p.confirm_edge_most:
+            return True
+        if spread > p.confirm_edge_spread:
             equal = equal_share([counted.code for counted in self._vouched])
             frames = [counted.frame for counted in self._vouched]
             if equal > p.confirm_equal:

@@ -280,10 +280,13 @@ class Parameters(Declared):
         0.6, '… between the two: two such windows without a common character are asked for below this …', '', 0.0, 1.0
     )
     confirm_edge_spread: float = parameter(
-        0.06, '… and above this spread of the edges about the borders of the bits; there moreover …', 'bit', 0.0, 1.0
+        0.06, '… and above this spread of the edges about the borders of the bits …', 'bit', 0.0, 1.0
+    )
+    confirm_edge_most: float = parameter(
+        0.22, '… and nothing is confirmed above this one: edges that lie anywhere have 0.29', 'bit', 0.0, 1.0
     )
     confirm_equal: float = parameter(
-        0.3, '… no more than this share of the pairs of ok codes so far may be equal …', '', 0.0, 1.0
+        0.3, '… there moreover no more than this share of the pairs of ok codes so far may be equal …', '', 0.0, 1.0
     )
     confirm_equal_on_comb: float = parameter(
         0.2, '… nor more than this where the falls lie on a comb', '', 0.0, 1.0
