@@ -34,6 +34,7 @@ from beacon_comm.core.index_image import hop_length_ns
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.receiver import Receiver
 from beacon_comm.core.tracks import Track
+from beacon_comm.evaluation.scoring import wilson_interval
 from beacon_comm.simulation.description import make_description
 from beacon_comm.simulation.scene import simulate
 from beacon_comm.simulation.truth import BeaconTruth, SceneTruth
@@ -102,17 +103,9 @@ class Score:
         self.right, self.sent, self.labels = self.right + other.right, self.sent + other.sent, max(self.labels, other.labels)
 
     def text(self) -> str:
-        low, high = wilson(self.right, self.sent)
-        return f'{self.right / max(self.sent, 1):.1%} of {self.sent} ({low:.1%} – {high:.1%})'
-
-
-def wilson(right: int, of: int) -> tuple[float, float]:
-    """Return the 95 % interval of a share (Wilson, 1927)."""
-    if of == 0:
-        return 0.0, 1.0
-    z, p = 1.96, right / of
-    middle, half = p + z * z / (2 * of), z * math.sqrt(p * (1 - p) / of + z * z / (4 * of * of))
-    return max((middle - half) / (1 + z * z / of), 0.0), min((middle + half) / (1 + z * z / of), 1.0)
+        share = self.right / max(self.sent, 1)
+        interval = wilson_interval(share, self.sent)
+        return f'{share:.1%} of {self.sent} ({interval.low:.1%} – {interval.high:.1%})'
 
 
 def score(
@@ -446,11 +439,8 @@ def reached(found: dict[str, Any]) -> str:
         best = max((speed for speed in shares if not below or speed < below[0]), default=0)
         return f'{kind} {best:,} px/s'
 
-    def of(part: str, word: str) -> dict[str, Any]:
-        return {key: value for key, value in found[part].items() if word in key}
-
-    crossed = {key: value for key, value in of('crossings', 'motion').items() if '3 radii' in key}
-    at_once = [int(key.split()[0]) for key, value in of('many', 'motion').items() if value['least'] >= 0.99]
+    crossed = found['crossings']['3 radii motion']
+    at_once = [int(key.split()[0]) for key, value in found['many'].items() if 'motion' in key and value['least'] >= 0.99]
     waits = found['confirmed']
     errors = {name: value['rms error (px)'] for name, value in found['errors'].items()}
     consistency = [value['NEES over its expectation'] for value in found['errors'].values()]
@@ -458,7 +448,7 @@ def reached(found: dict[str, Any]) -> str:
         ['characters ≥ 99 % right up to', '2,000 px/s', '5,000 px/s', f'{fastest("line")}, {fastest("circle")}'],
         ['beacons at once, each ≥ 99 %', '32', '64', str(max(at_once))],
         ['crossings from 3 radii, labels kept', '100 of 100', '1,000 of 1,000',
-         ', '.join(f'{one["kept"]} of {sum(one.values())}' for one in crossed.values())],
+         f'{crossed["kept"]} of {sum(crossed.values())}'],
         ['hidden for 100 ms (aim: 20 ms): characters missed at most', '3', '3',
          ', '.join(f'{value["characters missed, most"]} ({key})' for key, value in found['hidden'].items())],
         ['shaken texture, right of sent', '≥ 99 % at 10 Mev/s', '20 Mev/s',
@@ -522,8 +512,9 @@ def draw(found: dict[str, Any], path: Path) -> None:
             points = [(int(k.split()[1]), v) for k, v in found['speeds'].items() if k.startswith(kind) and k.endswith(tracker)]
             speed = [point[0] for point in points]
             share = np.array([v[0] / max(v[1], 1) for _, v in points])
-            bounds = np.array([wilson(v[0], v[1]) for _, v in points]).clip(0, 1)
-            below, above = np.maximum(share - bounds[:, 0], 0), np.maximum(bounds[:, 1] - share, 0)
+            bounds = [wilson_interval(one, v[1]) for one, (_, v) in zip(share, points, strict=True)]
+            below = np.maximum(share - [one.low for one in bounds], 0)
+            above = np.maximum([one.high for one in bounds] - share, 0)
             bars = 100 * np.stack((below, above))
             axis.errorbar(speed, 100 * share, bars, marker='o', capsize=3, color=colour, label=tracker)
         axis.axhline(99, color='grey', linewidth=0.8, linestyle=':')
