@@ -54,12 +54,12 @@ from beacon_comm.core.tracks import (
     EXTENT_RISE,
     FIRST_SPEED_PX_PER_S,
     FLOOR_PX,
-    SAME_RATE,
     SURPRISE,
     Covariance,
     Track,
     TrackChanges,
     Tracker,
+    is_same_rate,
     positions_at,
 )
 
@@ -117,15 +117,10 @@ class Steady:
         return jump <= _JUMP_PX_PER_S + _JUMP_SHARE * math.hypot(self.vx_px_per_s, self.vy_px_per_s)
 
 
-def _is_unread(track: Track) -> bool:
-    """Return whether nobody has read a track yet, nor the one whose label it has taken."""
-    return track.bit_rate_bps is None and track.claimed_bps is None
-
-
 def _may_be_same(one: Track, other: Track) -> bool:
     """Return whether two tracks may be of one beacon: not if both bit rates are known, and are different."""
-    rates = one.bit_rate_bps, other.bit_rate_bps
-    return rates[0] is None or rates[1] is None or abs(rates[1] / rates[0] - 1.0) <= SAME_RATE
+    rate_bps, other_bps = one.bit_rate_bps, other.bit_rate_bps
+    return rate_bps is None or other_bps is None or is_same_rate(other_bps, rate_bps)
 
 
 @dataclass(slots=True)
@@ -218,7 +213,7 @@ class MotionTrack(Track):
         motion.begin(self.row, (t_ns - self.origin_ns) / NS_PER_S, x_px, y_px, vx, vy, variance_px2, _JUMP_PX_PER_S**2)
         self.settle()
         self.extent_px = before.extent_px
-        self.steady = Steady(x_px, y_px, vx, vy, before.extent_px, t_ns)
+        self.steady = Steady.of(self, t_ns)
 
     def stop(self, x_px: float, y_px: float, t_ns: int) -> None:
         """Wait at a place from ``t_ns`` (ns) on."""
@@ -301,9 +296,8 @@ class MotionTracker(Tracker):
             if t_hop_ns - track.last_seen_ns >= self._reacquire_ns:
                 del self._remembered[track_id]
         for one in lost:
-            rate_bps = one.bit_rate_bps if one.claimed_bps is None else one.claimed_bps
-            if isinstance(one, MotionTrack) and rate_bps is not None and one.covered_since_ns is None:
-                self._remembered[one.track_id] = replace(one, bit_rate_bps=rate_bps, row=one.row.copy())
+            if isinstance(one, MotionTrack) and one.known_bps is not None and one.covered_since_ns is None:
+                self._remembered[one.track_id] = replace(one, bit_rate_bps=one.known_bps, row=one.row.copy())
 
     def _new_track(self, blob: Blob, t_hop_ns: int, tried_ns: int) -> Track:
         old = self._recognised(blob, t_hop_ns)
@@ -391,7 +385,7 @@ class MotionTracker(Tracker):
         if super()._ended(track, t_hop_ns):
             return True
         since = track.covered_since_ns
-        if since is None or not _is_unread(track):
+        if since is None or track.known_bps is not None:
             return False
         return since - track.first_seen_ns < _NEW_S * NS_PER_S and t_hop_ns - since >= self._merge_unread_ns
 
@@ -407,7 +401,7 @@ class MotionTracker(Tracker):
         centre = positions_at(tracks, t_hop_ns)
         extent = np.array([track.extent_px for track in tracks])
         quiet = np.array([track.quiet for track in tracks])
-        unread = np.array([_is_unread(track) for track in tracks])
+        unread = np.array([track.known_bps is None for track in tracks])
         distance = np.hypot(*(centre[:, None, :] - centre[None, :, :]).transpose(2, 0, 1))
         near = distance < _SAME_EXTENTS * np.minimum(extent[:, None], extent[None, :])
         near |= (distance < extent[None, :]) & quiet[:, None] & ~quiet[None, :]
@@ -433,36 +427,40 @@ class MotionTracker(Tracker):
         self, tracks: list[MotionTrack], blobs: Sequence[Blob], left: list[tuple[int, int]], t_hop_ns: int
     ) -> list[tuple[int, int]]:
         """Let tracks that were dragged away return to a blob that is left over where they would be; return the other blobs."""
-        gate = self._parameters.association_gate_px
         for track in tracks:
             if track.bit_rate_bps is None or track.track_id not in self._tracks:
                 continue
             before = track.jumped(t_hop_ns)
-            if before is None:
-                if not track.quiet:
-                    track.steady = Steady.of(track, t_hop_ns)
-                continue
-            for entry in left:
-                blob = blobs[entry[1]]
-                if math.dist(before.position_at(blob.t_ns), (blob.x_px, blob.y_px)) <= gate:
-                    track.return_to(blob.x_px, blob.y_px, blob.t_ns, blob.variance_px2 + FLOOR_PX**2, before)
-                    left = [other for other in left if other is not entry]
-                    break
-            else:
-                for other in tracks:
-                    if other.track_id not in self._tracks:
-                        continue
-                    reach = min(other.extent_px, before.extent_px) + gate
-                    near = math.dist(before.position_at(t_hop_ns), other.position_at(t_hop_ns)) <= reach
-                    if near and not other.quiet and other.bit_rate_bps is None and before.fits(other):
-                        self.exchange(track.track_id, other.track_id)
-                        track.steady, other.steady = Steady.of(track, t_hop_ns), None
-                        break
-                else:
-                    x, y = before.position_at(t_hop_ns)
-                    if track.quiet and 0.0 <= x < self._sensor_size[0] and 0.0 <= y < self._sensor_size[1]:
-                        track.return_to(x, y, t_hop_ns, gate**2, before)  # what dragged it away is gone
+            if before is not None:
+                taken = self._return_one(track, before, tracks, blobs, left, t_hop_ns)
+                left = [entry for entry in left if entry is not taken]
+            elif not track.quiet:
+                track.steady = Steady.of(track, t_hop_ns)
         return left
+
+    def _return_one(
+        self, track: MotionTrack, before: Steady, tracks: list[MotionTrack], blobs: Sequence[Blob],
+        left: list[tuple[int, int]], t_hop_ns: int,
+    ) -> tuple[int, int] | None:  # fmt: skip
+        """Let a track go on in what is where it would be; return the blob that is now its own, if it is one that was left."""
+        gate = self._parameters.association_gate_px
+        for entry in left:
+            blob = blobs[entry[1]]
+            if math.dist(before.position_at(blob.t_ns), (blob.x_px, blob.y_px)) <= gate:
+                track.return_to(blob.x_px, blob.y_px, blob.t_ns, blob.variance_px2 + FLOOR_PX**2, before)
+                return entry
+        x, y = before.position_at(t_hop_ns)
+        for other in tracks:
+            if other.track_id not in self._tracks or other.quiet or other.bit_rate_bps is not None:
+                continue
+            reach = min(other.extent_px, before.extent_px) + gate
+            if math.dist((x, y), other.position_at(t_hop_ns)) <= reach and before.fits(other):
+                self.exchange(track.track_id, other.track_id)
+                track.steady, other.steady = Steady.of(track, t_hop_ns), None
+                return None
+        if track.quiet and 0.0 <= x < self._sensor_size[0] and 0.0 <= y < self._sensor_size[1]:
+            track.return_to(x, y, t_hop_ns, gate**2, before)  # what dragged it away is gone
+        return None
 
     def _take_over(self, older: MotionTrack, younger: MotionTrack) -> None:
         """Let a quiet track go on where a younger one is."""

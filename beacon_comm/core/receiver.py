@@ -31,7 +31,7 @@ from beacon_comm.core.meetings import Meetings
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.routing import Routed
 from beacon_comm.core.signal_detection import WholeSignal
-from beacon_comm.core.tracks import SAME_RATE, Covariance, Track, TrackChanges
+from beacon_comm.core.tracks import Covariance, Track, TrackChanges, is_same_rate
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,10 +245,10 @@ class Receiver:
             self._settled_ns[track_id] = before_ns.get(track_id, t_ns)
             track.bit_rate_bps = rate_bps
             if track.claimed_bps is not None:
-                if abs(rate_bps / track.claimed_bps - 1.0) > SAME_RATE:
-                    self._detection.disown(track_id)
-                else:
+                if is_same_rate(rate_bps, track.claimed_bps):
                     track.claimed_bps = None
+                else:
+                    self._detection.disown(track_id)
 
     def _lose(
         self, changes: TrackChanges, characters: list[ReceivedCharacter], lost: list[BeaconSnapshot]

@@ -40,7 +40,7 @@ FIRST_SPEED_PX_PER_S = 200.0  # standard deviation of an unknown velocity
 _KNOWN_AFTER_NS = 100_000_000  # a velocity seen for less long is not gone on with
 FLOOR_PX = 0.05  # an observation is never better than this
 SURPRISE = 16.0  # an innovation of more than 4 standard deviations is a manoeuvre
-SAME_RATE = 0.02  # the same beacon's bit rates differ by less
+_SAME_RATE = 0.02  # the same beacon's bit rates differ by less
 _NEVER = -(1 << 63)
 Covariance = tuple[tuple[float, float], tuple[float, float]]
 """((xx, xy), (xy, yy))."""
@@ -96,6 +96,11 @@ class Track:
     claimed_bps: float | None = None
     variance: tuple[float, float, float] = field(default=(1.0, 0.0, FIRST_SPEED_PX_PER_S**2))
     noise: float = _ACCELERATION
+
+    @property
+    def known_bps(self) -> float | None:
+        """The bit rate (bit/s) of what its label stands for, None: nobody has read that yet."""
+        return self.bit_rate_bps if self.claimed_bps is None else self.claimed_bps
 
     def position_at(self, t_ns: int) -> tuple[float, float]:
         """Return the predicted centre (px) at ``t_ns`` (ns)."""
@@ -361,6 +366,11 @@ class Tracker:
             track_id, blob.x_px, blob.y_px, blob.t_ns, blob.extent_px, blob.index, blob.t_ns, blob.t_ns,
             matched_ns=t_hop_ns, tried_ns=tried_ns, variance=variance,
         )  # fmt: skip
+
+
+def is_same_rate(one_bps: float, other_bps: float) -> bool:
+    """Return whether two bit rates (bit/s) may be one beacon's."""
+    return abs(one_bps / other_bps - 1.0) <= _SAME_RATE
 
 
 def positions_at(tracks: Sequence[Track], t_ns: int) -> NDArray[np.float64]:
