@@ -18,7 +18,9 @@ are one spot, both move as it does and their distance goes on as predicted.  Sha
 one another off instead of passing through one another, and leave with each other's label.
 
 A light that moves while it is on gives ON events at its front and OFF events at its back.  So an observation is the middle
-between the means of both; a burst of one polarity waits for some events of the other, if that makes a difference.
+between the means of both, and a burst of one polarity waits for some events of the other, if that makes a difference: if ON
+events are ahead, by what is learnt of each track as a time, from how far observations of more ON or more OFF events are off
+along its way.  What is not waited for is put right by that.
 
 The events of a track that moves by more than a share of its radius in a hop are hidden from the detection windows:
 there they would be a trail of it, in which false tracks begin.
@@ -39,6 +41,7 @@ from beacon_comm.core import motion
 from beacon_comm.core.events import NS_PER_S, EventBatch
 from beacon_comm.core.hop_events import ROUTED, HopEvents
 from beacon_comm.core.motion import (
+    AHEAD,
     DOUBTED_X,
     DOUBTED_Y,
     EXTENT,
@@ -47,7 +50,6 @@ from beacon_comm.core.motion import (
     HOP_ON,
     HOP_RR,
     LAST,
-    LEAD2,
     LONG_OFF,
     LONG_ON,
     N_OFF,
@@ -79,13 +81,13 @@ _LEAST_SPAN_S = 1e-4  # … be it for so long or longer
 # The variance of observations is learnt from their errors, within bounds: a burst's events are of all pixels alike, which
 # says more than as many at random, and of one moment, which says less.
 _TRUST_GAIN, _MOST_ERROR = 0.03, 5.0
-_LEAST_TRUST, _MOST_TRUST = 0.15, 10.0
+_LEAST_TRUST, _MOST_TRUST = 0.4, 10.0
 _SHARED = 2.0  # events that may be another track's tell so much less
-_EITHER = 12  # so many of either polarity tell how far they are apart
-_LEAD_GAIN = 0.05
+_AHEAD_GAIN = 0.01  # how fast it is learnt how far ON events are ahead …
+_AHEAD_SPEED = 100.0  # … of a light that moves by more than this (px/s)
 _DOUBTED = 9.0  # an observation so much farther off than expected (squared), and than what turns back since the last one, …
 _OFF_SHARE = 0.5  # … may be of the first rows of a burst alone: off by so much of the radius (standard deviation)
-_BALANCE = 0.2  # a share of ON events so much unlike the usual one is a burst of one polarity …
+_BALANCE = 0.2  # where one polarity counts for so much more than the other one, it is a burst of it …
 _SMALL_LEAD = 1.0  # … worth waiting for the other one where it is off by more than this, over the variance, …
 _MOST_EVENTS = 4000  # … for no more than so many events …
 _LONGEST_WAIT_S = 4e-3  # … and no longer than this
@@ -333,20 +335,23 @@ def _update(row, doubt, at_once):  # type: ignore[no-untyped-def]
     weight = a * off + b * on
     dx, dy = (a * sums[1] + b * sums[5]) / weight, (a * sums[2] + b * sums[6]) / weight
     dt = (a * sums[3] + b * sums[7]) / weight
+    side = (b * on - a * off) / weight  # 1: ON events alone, -1: OFF events
+    vx, vy = row[VX], row[VY]
+    ahead_s = side * row[AHEAD]
+    dx, dy = dx - ahead_s * vx, dy - ahead_s * vy
     spread = 0.5 * max(sums[8] - n * (dx * dx + dy * dy), 0.0)
     spread = max((spread + _PRIOR_EVENTS * 0.25 * row[EXTENT] ** 2) / (n + _PRIOR_EVENTS), _LEAST_SPREAD_PX2)
     few = (a * a * off + b * b * on) / (weight * weight)  # 1/n where all count alike
     variance = (row[TRUST] if n >= UPDATE_EVENTS else 1.0) * spread * few
-    if min(off, on) >= _EITHER:
-        lead_x, lead_y = 0.5 * (sums[5] / on - sums[1] / off), 0.5 * (sums[6] / on - sums[2] / off)
-        lead2 = lead_x * lead_x + lead_y * lead_y - 0.5 * spread * (1.0 / off + 1.0 / on)
-        row[LEAD2] += _LEAD_GAIN * (max(lead2, 0.0) - row[LEAD2])
-    more = 2.0 * (on / n - usual_on)
-    lead2 = row[LEAD2] * more * more
-    if lead2 > _SMALL_LEAD * variance and abs(more) > _BALANCE and n < _MOST_EVENTS and age_s < _LONGEST_WAIT_S and not at_once:
+    speed2 = vx * vx + vy * vy
+    lead2 = ahead_s * ahead_s * speed2
+    one_sided = lead2 > _SMALL_LEAD * variance and abs(side) > _BALANCE
+    if one_sided and n < _MOST_EVENTS and age_s < _LONGEST_WAIT_S and not at_once:
         return False
     variance += 0.5 * lead2
     row[N_OFF : SINCE + 1] = 0.0
+    learnt_s = row[AHEAD] + _AHEAD_GAIN * side * (dx * vx + dy * vy) / (speed2 + _AHEAD_SPEED * _AHEAD_SPEED)
+    row[AHEAD] = min(max(learnt_s, 0.0), row[EXTENT] / (math.sqrt(speed2) + _AHEAD_SPEED))
     variance = _doubted(row, dt, dx, dy, variance)
     error, part = observe(row, dt, dx, dy, variance * doubt)
     if doubt == 1.0:

@@ -74,12 +74,10 @@ _SAME_EXTENTS = 1.1  # two tracks of one blob are half a disc's centroids apart:
 _MERGE_UNREAD_S = 0.03  # a double that nobody has read yet has nothing to lose: before both are read …
 _NEW_S = 0.2  # … if it was a double soon after it began: what comes by later is another light
 # What is told of the error, calibrated on simulated scenes (docs/tracking.py, the part "errors").  Errors to the other side
-# cancel for longer than one observation; a prediction is better than the likely modes' accelerations say; a moving light's
-# edges, its turns and the readout row by row add what grows with the speed.
-_CANCEL = 4.8
-_GROWTH_SHARE = 0.35
-_AT_REST, _MOVING_PER_PX_PER_S = 0.75, 0.95e-3
-_LEAST_SHARE = 0.1
+# cancel for longer than one observation; a prediction is better than the likely modes' accelerations say, the slower the
+# better.
+_CANCEL, _LEAST_SHARE, _VARIANCE_SHARE = 8.0, 0.1, 2.8
+_GROWTH_SHARE, _GROWTH_SPEED_PX_PER_S = 1.2, 1000.0
 _JUMP_PX_PER_S, _JUMP_SHARE = 300.0, 0.3  # a velocity jumps by more than so much and this share of it …
 _JUMPED_S = 0.1  # … and what was before is remembered for so long
 _LIKE_EXTENT = 4.0  # what is so many times as large is something else
@@ -172,7 +170,7 @@ class MotionTrack(Track):
         speed = math.hypot(vx, vy)
         share = max(1.0 + _CANCEL * min(float(self.row[AGAIN]), 0.0), _LEAST_SHARE)
         variance, growth = motion.likely_variance(self.row, max(0, t_ns - self.t_ns) / NS_PER_S)
-        both = (variance * share + _GROWTH_SHARE * growth) * (_AT_REST + _MOVING_PER_PX_PER_S * speed)
+        both = _VARIANCE_SHARE * share * variance + _GROWTH_SHARE * speed / (speed + _GROWTH_SPEED_PX_PER_S) * growth
         both += _GRAIN_PX**2 / (1.0 + speed / _GRAIN_SPEED_PX_PER_S)
         along = (_LATENCY_SHARE * self.latency_s) ** 2
         cross = along * vx * vy
