@@ -258,8 +258,10 @@ def main() -> None:
     with ProcessPoolExecutor(options.processes) as pool:
         results = [(name, pool.submit(watch, name, number, options.seed, options.seconds, folder)) for name, number in jobs]
         try:
-            for name, result in tqdm(results, desc='scenes'):
+            bar = tqdm(results, desc='scenes')
+            for name, result in bar:
                 found[name] += result.result()
+                bar.set_postfix(confirmed=sum(count.confirmed for name, count in found.items() if name != CONTROL))
         except KeyboardInterrupt:  # the page of what is counted so far
             pool.shutdown(wait=False, cancel_futures=True)
             interrupted = f'  # stopped after {sum(count.scenes for count in found.values())} of {len(jobs)} scenes'
