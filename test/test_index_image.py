@@ -6,7 +6,8 @@ from disc_events import HOP_NS, T0_NS, batch, gathered, hops, noise
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from beacon_comm.core.index_image import MOST_COUNTED, IndexImages, whole_hops
+from beacon_comm.core.errors import ParameterError
+from beacon_comm.core.index_image import IndexImages, most_of_a_hop, whole_hops, window_hops
 from beacon_comm.core.parameters import Parameters
 
 SIZE = (40, 30)
@@ -56,19 +57,26 @@ def test_windows_run_empty():
 def test_a_count_ends_and_runs_empty_again():
     """What is not counted is not taken off either, in whichever window it was."""
     images = IndexImages(Parameters(), SIZE)
-    many = MOST_COUNTED - 10
     lone = hop_events(batch([7], [3], [-1], [T0_NS]))
-    full = batch([7] * many, [3] * many, [1] * many, np.full(many, T0_NS))
-    images.push(hop_events(full))
-    images.push(hop_events(full))
+    full = hop_events(batch([7] * 300, [3] * 300, [1] * 300, np.full(300, T0_NS)))
+    images.push(full)
+    images.push(full)
     for window in images.windows:
-        assert images.counts(window)[:, 3, 7].tolist() == [0, MOST_COUNTED]
+        assert images.counts(window)[:, 3, 7].tolist() == [0, 2 * 255]
     images.push(lone)
-    assert images.counts(images.windows[0])[:, 3, 7].tolist() == [1, 10]  # those of the first hop are gone
-    assert images.counts(images.windows[1])[:, 3, 7].tolist() == [1, MOST_COUNTED]
+    assert images.counts(images.windows[0])[:, 3, 7].tolist() == [1, 255]  # those of the first hop are gone
+    assert images.counts(images.windows[1])[:, 3, 7].tolist() == [1, 2 * 255]
     for _ in range(images.windows[-1].hops):
         images.push(hop_events(batch([], [], [], [])))
     assert not any(window.counts.any() for window in images.windows)
+
+
+def test_no_window_is_too_long_for_its_counts():
+    slow = Parameters(bit_rates=(20.0,), hop_s=0.001)
+    assert window_hops(slow) == (20, 1100)
+    assert most_of_a_hop(slow) * 1100 < 1 << 15 <= (most_of_a_hop(slow) + 1) * 1100
+    with pytest.raises(ParameterError, match='long_window_bits'):
+        Parameters(bit_rates=(20.0,), hop_s=0.001, long_window_bits=1000.0)
 
 
 def test_a_long_window_no_longer_than_the_short_one_is_not_kept():
@@ -91,7 +99,7 @@ def test_noise_pixel_scores_low_and_a_balanced_one_high():
 
 
 @settings(max_examples=30, deadline=None)
-@given(st.lists(st.integers(0, 400), min_size=1, max_size=30), st.integers(1000, 5000))
+@given(st.lists(st.integers(0, 400), min_size=1, max_size=30), st.integers(1000, 50_000))
 def test_the_ring_is_bounded_and_overflow_counted(sizes, max_bytes):
     images = IndexImages(Parameters(bit_rates=(100.0,), window_max_bytes=max_bytes), SIZE)
     pushed = 0
@@ -106,7 +114,7 @@ def test_the_ring_is_bounded_and_overflow_counted(sizes, max_bytes):
         for window in images.windows:
             assert window.counts.sum() == window.events
             assert window.counts.min() >= 0
-    if pushed * 8 <= max_bytes:
+    if pushed * 8 + len(sizes) * images.grid.numbers * 136 / 64 <= max_bytes:
         assert images.overflow_events == 0
     assert images.windows[-1].events + images.overflow_events <= pushed
 

@@ -39,7 +39,7 @@ from beacon_comm.core.components import (
     ComponentSet,
     paint,
 )  # fmt: skip
-from beacon_comm.core.hop_events import BAND_PIXELS, BAND_SHIFT, CODE_BITS, HopEvents, PixelGrid
+from beacon_comm.core.hop_events import CODE_BITS, WORD_SHIFT, HopEvents, PixelGrid
 from beacon_comm.core.index_image import IndexImages, Window, hop_length_ns
 from beacon_comm.core.nearest import CELL_SHIFT, cell_lists, cells_along
 from beacon_comm.core.parameters import Parameters
@@ -196,8 +196,7 @@ class BlobFinder:
         first, member = cell_lists(box, width, height)
         circle = np.stack((x, y, radius**2), axis=1)
         summed: NDArray[np.int64] = _sum_newest(
-            newest.code, newest.offset_ns, newest.first, self._grid.shift, cells_along(width),
-            first, member, circle, self.owner,
+            newest.code, newest.offset_ns, self._grid.shift, cells_along(width), first, member, circle, self.owner
         )  # fmt: skip
         return summed
 
@@ -230,7 +229,8 @@ def _long_stands(run, first, fits, short_label, short_fits, short_counts):  # ty
         count_in = count_out = np.int64(0)
         for k in range(first[c], first[c + 1]):
             for p in range(run[k, 0], run[k, 1]):
-                n = np.int64(short_counts[0, p]) + np.int64(short_counts[1, p])
+                word, place = p >> WORD_SHIFT, p & 63
+                n = np.int64(short_counts[word, 0, place]) + np.int64(short_counts[word, 1, place])
                 s = short_label[p] - 1
                 if s >= 0 and short_fits[s]:
                     area_in += 1
@@ -251,40 +251,31 @@ def _long_stands(run, first, fits, short_label, short_fits, short_counts):  # ty
 
 
 @njit(cache=True, nogil=True)
-def _sum_newest(  # type: ignore[no-untyped-def]
-    code, offset_ns, band_first, shift, cells_across, first, member, circle, owner
-):
+def _sum_newest(code, offset_ns, shift, cells_across, first, member, circle, owner):  # type: ignore[no-untyped-def]
     """Sum up the newest events of each blob; see :meth:`BlobFinder._sum_newest`."""
     sums = np.zeros((len(circle), 5), np.int64)
-    cell_rows = (len(first) - 1) // cells_across
-    for band in range(len(band_first) - 1):
-        start = band << BAND_SHIFT
-        top = min((start >> shift) >> CELL_SHIFT, cell_rows)
-        bottom = min((((start + BAND_PIXELS - 1) >> shift) >> CELL_SHIFT) + 1, cell_rows)
-        if first[top * cells_across] == first[bottom * cells_across]:
+    for i in range(len(code)):
+        p = np.int64(code[i] >> np.uint32(CODE_BITS))
+        y = p >> shift
+        x = p - (y << shift)
+        cell = np.uint64((y >> CELL_SHIFT) * cells_across + (x >> CELL_SHIFT))
+        begin, end = np.uint64(first[cell]), np.uint64(first[cell + np.uint64(1)])
+        if begin == end:
             continue
-        for i in range(band_first[band], band_first[band + 1]):
-            p = np.int64(code[i] >> np.uint32(CODE_BITS))
-            y = p >> shift
-            x = p - (y << shift)
-            cell = np.uint64((y >> CELL_SHIFT) * cells_across + (x >> CELL_SHIFT))
-            begin, end = np.uint64(first[cell]), np.uint64(first[cell + np.uint64(1)])
-            if begin == end:
-                continue
-            b = np.int64(owner[p]) - 1
-            if b == -1:
-                nearest2 = np.inf
-                for k in range(begin, end):
-                    m = np.uint64(member[k])
-                    dx, dy = x - circle[m, 0], y - circle[m, 1]
-                    d2 = dx * dx + dy * dy
-                    if d2 <= circle[m, 2] and d2 < nearest2:
-                        nearest2 = d2
-                        b = np.int64(m)
-            if b >= 0:
-                sums[b, 0] += 1
-                sums[b, 1] += x
-                sums[b, 2] += y
-                sums[b, 3] += x * x + y * y
-                sums[b, 4] += offset_ns[i]
+        b = np.int64(owner[p]) - 1
+        if b == -1:
+            nearest2 = np.inf
+            for k in range(begin, end):
+                m = np.uint64(member[k])
+                dx, dy = x - circle[m, 0], y - circle[m, 1]
+                d2 = dx * dx + dy * dy
+                if d2 <= circle[m, 2] and d2 < nearest2:
+                    nearest2 = d2
+                    b = np.int64(m)
+        if b >= 0:
+            sums[b, 0] += 1
+            sums[b, 1] += x
+            sums[b, 2] += y
+            sums[b, 3] += x * x + y * y
+            sums[b, 4] += offset_ns[i]
     return sums

@@ -19,8 +19,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from beacon_comm.core.hop_events import PixelGrid
-from beacon_comm.core.index_image import WORD_SHIFT, Window
+from beacon_comm.core.hop_events import WORD_SHIFT, PixelGrid
+from beacon_comm.core.index_image import Window
 from beacon_comm.core.parameters import Parameters
 
 # Columns of ComponentSet.sums.
@@ -79,7 +79,7 @@ class ComponentFinder:
     def find(self, window: Window) -> ComponentSet:
         """Return the components of ``window``; the label image is valid until the next call."""
         paint(self._run, self._label, 0)
-        bits = window.low[: self._grid.height]
+        bits = window.low
         if self._closing_px > 1:
             _close(bits, self._closing_px, self._grid.width, self._wide, self._closed)
             bits = self._closed
@@ -308,7 +308,7 @@ def _sum_run(start, stop, left, counts, threshold, offset, index_sum):  # type: 
     n_sum = x_sum = xx_sum = np.int64(0)
     seeds = 0
     for p in range(start, stop):
-        off, on = np.int64(counts[0, p]), np.int64(counts[1, p])
+        off, on = np.int64(counts[p >> WORD_SHIFT, 0, p & 63]), np.int64(counts[p >> WORD_SHIFT, 1, p & 63])
         n, base = on + off, offset + abs(on - off)
         x = left + p - start
         n_sum += n

@@ -1,12 +1,14 @@
-"""The events of one hop, sorted into bands of the sensor.
+"""The events of one hop: a list of them, and how many each pixel has.
 
-Pixels are numbered row by row with a stride that is a power of two, so that a number is taken apart by shifts, and
-32,768 numbers on end are a *band*: whole rows, whose counts fit the processor's own cache.
+Pixels are numbered row by row with a stride that is a power of two, so that a number is taken apart by shifts; 64 of
+them on end are a *word*, as in the images of one bit a pixel.
 
-    pixel   p = y stride + x            stride >= width, a power of two      band = p / 32,768
-    code    uint32  [ p: 28 bits | not counted in the long, short window | routed | on ]
+    pixel    p = y stride + x           stride >= width, a power of two       word = p / 64
+    code     uint32  [ p: 30 bits | routed | on ]                            in the order of arrival
+    counts   uint8   word after word that has events: 64 pixels' OFF events, then their ON events
 
-The order within a band is that of arrival.
+Events are counted as they arrive, so that a hop has no event to look at, but words.  A hop counts no more than so many
+events of a pixel and polarity.
 """
 
 from __future__ import annotations
@@ -19,12 +21,11 @@ from numpy.typing import NDArray
 
 MAX_WIDTH = 1 << 12
 MAX_HEIGHT = 1 << 16
-BAND_SHIFT = 15
-BAND_PIXELS = 1 << BAND_SHIFT
-_SHORTEST_STRIDE_SHIFT = 6  # a row of the low pixels' bits is whole words of 64
+WORD_SHIFT = 6  # 64 pixels a word
+WORD_COUNTS = 2 << WORD_SHIFT  # OFF and ON of each
 
 ON, ROUTED = 1, 2
-CODE_BITS = 4
+CODE_BITS = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +50,7 @@ class PixelGrid:
     @property
     def shift(self) -> int:
         """Binary logarithm of the stride."""
-        return max(_SHORTEST_STRIDE_SHIFT, (self.width - 1).bit_length())
+        return max(WORD_SHIFT, (self.width - 1).bit_length())
 
     @property
     def stride(self) -> int:
@@ -57,30 +58,27 @@ class PixelGrid:
         return 1 << self.shift
 
     @property
-    def bands(self) -> int:
-        """Bands that hold the sensor's rows."""
-        return (((self.height << self.shift) - 1) >> BAND_SHIFT) + 1
-
-    @property
     def numbers(self) -> int:
-        """Pixel numbers of all bands, those beyond the sensor's borders too."""
-        return self.bands << BAND_SHIFT
+        """Pixel numbers of all rows, those beyond the sensor's right border too."""
+        return self.height << self.shift
 
 
 @dataclass(frozen=True, slots=True)
 class HopEvents:
-    """The events of one hop, band by band.
+    """The events of one hop.
 
     Attributes:
-        code: pixel, flags and polarity, ``(n,)`` uint32; see the module's head.
+        code: pixel, flag and polarity, ``(n,)`` uint32; see the module's head.
         offset_ns: time since ``t_start_ns`` (ns), ``(n,)`` uint32.
-        first: where each band's events begin, ``(bands + 1,)`` int64.
+        words: the words that have events, ascending, ``(m,)`` int64.
+        counts: their pixels' OFF and ON events, ``(m, 128)`` uint8.
         t_start_ns: the hop's begin (ns, sensor clock).
     """
 
     code: NDArray[np.uint32]
     offset_ns: NDArray[np.uint32]
-    first: NDArray[np.int64]
+    words: NDArray[np.int64]
+    counts: NDArray[np.uint8]
     t_start_ns: int
 
     def __len__(self) -> int:
@@ -88,44 +86,59 @@ class HopEvents:
 
     @property
     def size_bytes(self) -> int:
-        return int(self.code.nbytes + self.offset_ns.nbytes)
+        return int(self.code.nbytes + self.offset_ns.nbytes + self.words.nbytes + self.counts.nbytes)
 
 
-def no_events(bands: int) -> HopEvents:
+def no_events() -> HopEvents:
     """Return a hop without events."""
-    return HopEvents(np.empty(0, np.uint32), np.empty(0, np.uint32), np.zeros(bands + 1, np.int64), 0)
+    return HopEvents(
+        np.empty(0, np.uint32), np.empty(0, np.uint32), np.empty(0, np.int64), np.empty((0, WORD_COUNTS), np.uint8), 0
+    )
 
 
-def sorted_by_band(
-    code: NDArray[np.uint32], offset_ns: NDArray[np.uint32], in_band: NDArray[np.int64], t_start_ns: int
-) -> HopEvents:
-    """Sort gathered events.
+class HopCounts:
+    """Counts the events of a hop as they arrive.
 
     Args:
-        code: see the module's head, ``(n,)`` uint32.
-        offset_ns: time since the hop's begin (ns), ``(n,)`` uint32.
-        in_band: how many of them are of each band, ``(bands,)`` int64.
-        t_start_ns: the hop's begin (ns, sensor clock).
+        grid: how the sensor's pixels are numbered.
+        most: events of a pixel and polarity that a hop counts, 1 to 255.
     """
-    first = np.zeros(len(in_band) + 1, np.int64)
-    np.cumsum(in_band, out=first[1:])
-    sorted_code, sorted_ns = np.empty_like(code), np.empty_like(offset_ns)
-    _sort(code, offset_ns, first[:-1].copy(), sorted_code, sorted_ns)
-    return HopEvents(sorted_code, sorted_ns, first, t_start_ns)
+
+    def __init__(self, grid: PixelGrid, most: int) -> None:
+        words = grid.numbers >> WORD_SHIFT
+        self._counts = np.zeros((words, WORD_COUNTS), np.uint8)
+        self._touched = np.zeros(words, np.uint8)
+        self._most = np.uint8(most)
+
+    def add(self, code: NDArray[np.uint32]) -> None:
+        """Count events, ``(n,)`` uint32; see the module's head."""
+        _count(code, self._counts.reshape(-1), self._touched, self._most)
+
+    def take(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+        """Return the words that have events and their counts, see :class:`HopEvents`, and begin anew."""
+        words = np.flatnonzero(self._touched)
+        counts = np.empty((len(words), WORD_COUNTS), np.uint8)
+        _take(words, self._counts.view(np.uint64), self._touched, counts.view(np.uint64))
+        return words, counts
 
 
 @njit(cache=True, nogil=True)
-def band_of(code):  # type: ignore[no-untyped-def]
-    """Return the band of an event."""
-    return code >> np.uint32(CODE_BITS + BAND_SHIFT)
-
-
-@njit(cache=True, nogil=True)
-def _sort(code, offset_ns, end, sorted_code, sorted_ns):  # type: ignore[no-untyped-def]
-    """Put every event behind those of its band that came before; ``end`` is where each band goes on."""
+def _count(code, counts, touched, most):  # type: ignore[no-untyped-def]
     for i in range(len(code)):
-        band = band_of(code[i])
-        at = np.uint64(end[band])
-        end[band] = at + np.uint64(1)
-        sorted_code[at] = code[i]
-        sorted_ns[at] = offset_ns[i]
+        pixel = np.uint64(code[i] >> np.uint32(CODE_BITS))  # unsigned, so that no place is taken to count from the end
+        word = pixel >> np.uint64(WORD_SHIFT)
+        at = (word << np.uint64(WORD_SHIFT + 1)) | (np.uint64(code[i] & np.uint32(ON)) << np.uint64(WORD_SHIFT))
+        at |= pixel & np.uint64((1 << WORD_SHIFT) - 1)
+        counts[at] += np.uint8(counts[at] < most)
+        touched[word] = 1
+
+
+@njit(cache=True, nogil=True)
+def _take(words, counts, touched, taken):  # type: ignore[no-untyped-def]
+    """Move the counts of some words, eight a number, to ``taken``."""
+    for k in range(len(words)):
+        word = np.uint64(words[k])
+        touched[word] = 0
+        for i in range(counts.shape[1]):
+            taken[k, i] = counts[word, i]
+            counts[word, i] = 0

@@ -29,7 +29,7 @@ from beacon_comm.core import motion
 from beacon_comm.core.association import assign
 from beacon_comm.core.blobs import SPREAD_EVENTS, Blob
 from beacon_comm.core.events import NS_PER_S
-from beacon_comm.core.index_image import whole_hops
+from beacon_comm.core.index_image import window_hops
 from beacon_comm.core.motion import (
     AGAIN,
     EXTENT,
@@ -223,9 +223,8 @@ class MotionTracker(Tracker):
 
     def __init__(self, parameters: Parameters, sensor_size: tuple[int, int]) -> None:
         super().__init__(parameters, sensor_size)
-        short = whole_hops(parameters.short_window_s, parameters.hop_s)
-        long = whole_hops(parameters.long_window_bits * parameters.slowest_bit_s, parameters.hop_s)
-        self._forget = np.array([1.0 - 1.0 / short] * 2 + [1.0 - 1.0 / max(short, long)] * 2)
+        hops = window_hops(parameters)
+        self._forget = np.repeat([1.0 - 1.0 / hops[0], 1.0 - 1.0 / hops[-1]], 2)
         self._reacquire_ns = round(parameters.reacquire_s * NS_PER_S)
         self._merge_unread_ns = round(min(_MERGE_UNREAD_S, parameters.merge_after_s) * NS_PER_S)
         self._remembered: dict[int, MotionTrack] = {}

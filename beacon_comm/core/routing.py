@@ -20,8 +20,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from beacon_comm.core.events import EventBatch
-from beacon_comm.core.hop_events import CODE_BITS, ROUTED, HopEvents, PixelGrid, band_of, sorted_by_band
-from beacon_comm.core.index_image import hop_length_ns
+from beacon_comm.core.hop_events import CODE_BITS, ROUTED, HopCounts, HopEvents, PixelGrid
+from beacon_comm.core.index_image import hop_length_ns, most_of_a_hop
 from beacon_comm.core.nearest import CELL_SHIFT, cell_lists, cells_along
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.tracks import Track, positions_at
@@ -61,7 +61,7 @@ class Router:
         self._factor, self._margin = parameters.routing_extent_factor, parameters.routing_margin_px
         self._code, self._offset_ns = np.empty(_FIRST_ROOM, np.uint32), np.empty(_FIRST_ROOM, np.uint32)
         self._index, self._owner = np.empty(_FIRST_ROOM, np.int32), np.empty(_FIRST_ROOM, np.int32)
-        self._in_band = np.zeros(self._grid.bands, np.int64)
+        self._counts = HopCounts(self._grid, most_of_a_hop(parameters))
         self._gathered = 0
         self.outside_events = 0
         self.aim((), 0)
@@ -98,7 +98,7 @@ class Router:
         )  # fmt: skip
         routed = self._own(segment, code) if self._track_ids else []
         kept = self._keep(start, n)
-        _count_bands(code[:kept], self._in_band)
+        self._counts.add(code[:kept])
         self._gathered += kept
         return routed
 
@@ -149,9 +149,7 @@ class Router:
     def close(self) -> HopEvents:
         """Return the events gathered in the hop interval, and begin the next one."""
         n, self._gathered = self._gathered, 0
-        events = sorted_by_band(self._code[:n], self._offset_ns[:n], self._in_band, self._t_hop_ns)
-        self._in_band[:] = 0
-        return events
+        return HopEvents(self._code[:n].copy(), self._offset_ns[:n].copy(), *self._counts.take(), self._t_hop_ns)
 
     def _make_room(self, n: int) -> None:
         room = 2 * (self._gathered + n)
@@ -176,12 +174,6 @@ def _pack(x, y, polarity, t_ns, shift, t_hop_ns, code, offset_ns):  # type: igno
         pixel = (np.uint32(y[i]) << np.uint32(shift)) | np.uint32(x[i])
         code[i] = (pixel << np.uint32(CODE_BITS)) | np.uint32(polarity[i] > 0)
         offset_ns[i] = t_ns[i] - t_hop_ns
-
-
-@njit(cache=True, nogil=True)
-def _count_bands(code, in_band):  # type: ignore[no-untyped-def]
-    for i in range(len(code)):
-        in_band[band_of(code[i])] += 1
 
 
 @njit(cache=True, nogil=True)

@@ -19,9 +19,9 @@ from beacon_comm.core.character import Character
 from beacon_comm.core.events import NS_PER_S, EventBatch
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.high_pass import HighPassFilter
-from beacon_comm.core.hop_events import BAND_SHIFT, CODE_BITS, ON, sorted_by_band
-from beacon_comm.core.index_image import IndexImages, hop_length_ns
+from beacon_comm.core.index_image import IndexImages, hop_length_ns, window_hops
 from beacon_comm.core.parameters import Parameters
+from beacon_comm.core.routing import Router
 from beacon_comm.evaluation.result import PathPoint
 from beacon_comm.evaluation.scoring import Transmission
 
@@ -247,8 +247,7 @@ def image_span_ns(t_ns: int, parameters: Parameters) -> tuple[int, int]:
     """Return the hops' begin and end (ns, on their grid) of the events that the image at ``t_ns`` needs."""
     hop_ns = hop_length_ns(parameters)
     end_ns = t_ns // hop_ns * hop_ns
-    hops = max(window.hops for window in IndexImages(parameters, (64, 64)).windows)
-    return end_ns - hops * hop_ns, end_ns
+    return end_ns - window_hops(parameters)[-1] * hop_ns, end_ns
 
 
 def view_image(
@@ -263,19 +262,15 @@ def view_image(
         origin_ns: sensor time at recording time 0 (ns).
         parameters: of the detection.
     """
-    images, finder = IndexImages(parameters, size), BlobFinder(parameters, size)
-    grid, hop_ns = images.grid, hop_length_ns(parameters)
-    inside = (batch.x < size[0]) & (batch.y < size[1])
-    number = (batch.y.astype(np.int64) << grid.shift) + batch.x
-    code = ((number << CODE_BITS) | np.where(batch.polarity > 0, ON, 0)).astype(np.uint32)
+    images, finder, router = IndexImages(parameters, size), BlobFinder(parameters, size), Router(parameters, size)
+    hop_ns = hop_length_ns(parameters)
     blobs: list[Blob] = []
-    for hop_begin_ns in range(begin_ns, batch.t_end_ns, hop_ns):
-        a, b = np.searchsorted(batch.t_ns, (hop_begin_ns, hop_begin_ns + hop_ns))
-        own = a + np.flatnonzero(inside[a:b])
-        in_band = np.bincount(number[own] >> BAND_SHIFT, minlength=grid.bands).astype(np.int64)
-        offset_ns = (batch.t_ns[own] - hop_begin_ns).astype(np.uint32)
-        images.push(sorted_by_band(code[own], offset_ns, in_band, hop_begin_ns))
-        blobs = finder.find(images, hop_begin_ns + hop_ns)
+    for t_hop_ns in range(begin_ns, batch.t_end_ns, hop_ns):
+        router.aim((), t_hop_ns)
+        start, stop = np.searchsorted(batch.t_ns, (t_hop_ns, t_hop_ns + hop_ns))
+        router.route(batch.slice(int(start), int(stop), t_hop_ns + hop_ns))
+        images.push(router.close())
+        blobs = finder.find(images, t_hop_ns + hop_ns)
     window = images.windows[0]
     return images.index(window), blobs, window.hops * parameters.hop_s
 

@@ -20,8 +20,7 @@ from beacon_comm.core.detection import Detector
 from beacon_comm.core.errors import ParameterError
 from beacon_comm.core.event_buffer import EventBuffer
 from beacon_comm.core.events import EventBatch
-from beacon_comm.core.hop_events import BAND_SHIFT, PixelGrid
-from beacon_comm.core.index_image import hop_length_ns, whole_hops
+from beacon_comm.core.index_image import hop_length_ns, window_hops
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.routing import Routed
 from beacon_comm.core.tracks import Track, TrackChanges, positions_at
@@ -117,10 +116,8 @@ class ReferenceImages:
 
     def __init__(self, parameters: Parameters, sensor_size: tuple[int, int]) -> None:
         self._size = sensor_size
-        short = whole_hops(parameters.short_window_s, parameters.hop_s)
-        long = whole_hops(parameters.long_window_bits * parameters.slowest_bit_s, parameters.hop_s)
         nothing = np.zeros((2, *sensor_size[::-1]), np.int64)
-        self.windows = [ReferenceWindow(hops, nothing) for hops in ((short, long) if long > short else (short,))]
+        self.windows = [ReferenceWindow(hops, nothing) for hops in window_hops(parameters)]
         self._ring = deque([_joined([])] * self.windows[-1].hops, maxlen=self.windows[-1].hops)
         self.overflow_events = 0
 
@@ -290,10 +287,9 @@ class ReferenceDetector(Detector):
 
     def _begin_buffers(self, blobs: list[Blob], changes: TrackChanges) -> None:
         """Begin each new track's buffer with the events on its blob's pixels that are in the blob's window."""
-        shift = BAND_SHIFT - PixelGrid(*self._sensor_size).shift
         for b, track in zip(changes.new_blobs, changes.new, strict=True):
             buffer = self._buffers[track.track_id] = EventBuffer(self._buffer_ns, self._parameters.buffer_max_bytes)
             seen = _joined(self._images.hop_events(self._images.windows[blobs[b].window]))
             of = np.flatnonzero((self._blobs.owner[seen.y, seen.x] == b + 1) & ~seen.routed)
-            of = of[np.lexsort((seen.y[of] >> shift, seen.t_ns[of]))]  # at one time band by band
+            of = of[np.argsort(seen.t_ns[of], kind='stable')]
             buffer.append(seen.t_ns[of], np.where(seen.on[of], 1, -1).astype(np.int8))
