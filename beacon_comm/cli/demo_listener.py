@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from beacon_comm.cli.demo_verdict import Heard
+from beacon_comm.cli.interrupts import interrupts_held
 from beacon_comm.core.character import Character, Status
 
 NODE = '/beacon_node'
@@ -75,7 +76,8 @@ class Listener:
 
     def spin_once(self) -> None:
         """Take what has arrived, or wait a moment for it."""
-        self._executor.spin_once(timeout_sec=_SPIN_S)
+        with interrupts_held():
+            self._executor.spin_once(timeout_sec=_SPIN_S)
         silent_since_s = time.monotonic() - SILENCE_S
         for track_id in [key for key, line in self._pending.items() if line.heard_s < silent_since_s]:
             self._flush(track_id)
