@@ -7,12 +7,14 @@ import sys
 from pathlib import Path
 
 import pytest
-from live_session import BIT_RATE, MS, STAMP_NS, START_NS, TEXT, TYPE, Session, beacon_events, packets
+from live_session import BIT_RATE, MS, PACKET_NS, STAMP_NS, START_NS, TEXT, TYPE, Session, beacon_events, packets
 
 from beacon_comm.compiling.warm_up import warm_up
 from beacon_comm.core.bearing import CameraModel
+from beacon_comm.core.detection import Detector
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.parameters import Parameters
+from beacon_comm.ros.live import Step
 from beacon_comm.ros.report import Report
 
 
@@ -22,6 +24,31 @@ def test_the_last_character_needs_no_further_packet() -> None:
     assert session.text() == TEXT[:-3]  # what is complete is decided two characters later
     session.wait(0.2)
     assert session.text() == TEXT
+
+
+def test_characters_are_given_before_the_work_of_the_hop_that_ends_their_interval(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, early = Session(), Session()
+    whole.push(packets(beacon_events()))
+    hop, before = Detector.hop, 0
+    for message in packets(beacon_events()):
+        done: list[str] = []
+        monkeypatch.setattr(Detector, 'hop', lambda *given, done=done: (done.append('hop'), hop(*given))[1])
+
+        def give(step: Step, done: list[str] = done) -> None:
+            early.steps.append(step)
+            done.append('given')
+
+        rest = early.live.push(message, early.now_ns, give)
+        assert not rest.characters
+        early.steps.append(rest)
+        early.now_ns += PACKET_NS
+        before += done[:2] == ['given', 'hop']
+    assert before > 10
+    assert early.characters() == whole.characters()
+    assert [due for step in early.steps for due in step.due_ns] == [due for step in whole.steps for due in step.due_ns]
+    assert [step.confirmed_changed for step in whole.steps].count(True) == [
+        step.confirmed_changed for step in early.steps
+    ].count(True) == 1
 
 
 def test_flush_gives_out_what_was_held_until_the_bit_rate_is_settled() -> None:

@@ -142,9 +142,21 @@ class Receiver:
         self._meetings = Meetings(parameters.hop_s) if parameters.tracker == 'motion' else None
 
     def push(self, batch: EventBatch) -> Output:
-        """Take the next events; the paper's section III, one call a stage.
+        """Take the next events and return what they gave.
 
         Batches must follow one another in time (see :mod:`beacon_comm.core.events`).
+        """
+        parts = list(self.parts(batch))
+        return Output(
+            tuple(one for part in parts for one in part.characters),
+            tuple(one for part in parts for one in part.lost),
+            any(part.confirmed_changed for part in parts),
+        )
+
+    def parts(self, batch: EventBatch) -> Iterator[Output]:
+        """Take the next events; give out the characters of a hop interval before the hop's own work, which takes its time.
+
+        The paper's section III, one call a stage.  The events are taken once all parts have been asked for.
         """
         characters: list[ReceivedCharacter] = []
         lost: list[BeaconSnapshot] = []
@@ -154,12 +166,15 @@ class Receiver:
             routed = self._detection.route(segment)
             characters += self._slots.demodulate(routed, segment.t_end_ns)
             if at_hop:
+                if characters:
+                    yield self._output(characters, lost)
+                    characters, lost = [], []
                 changes = self._detection.hop(segment.t_end_ns)
                 self._lose(changes, characters, lost)
                 characters += self._slots.assign(self._detection.tracks, segment.t_end_ns, self._detection.backlog)
                 self._compare_rates(segment.t_end_ns)
                 self._tell_apart(segment.t_end_ns)
-        return self._output(characters, lost)
+        yield self._output(characters, lost)
 
     def flush(self) -> Output:
         """End the stream: give out what is still held; the tracks stay."""

@@ -41,6 +41,7 @@ from beacon_comm.ros.silence import Cause, Silence, Situation, why_silent
 from beacon_comm.ros.text import Texts
 from beacon_comm.ros.throttled_log import ThrottledLog
 from beacon_comm.ros.topic import (
+    MessageQueue,
     Publishers,
     choose_type,
     find_publishers,
@@ -48,14 +49,13 @@ from beacon_comm.ros.topic import (
     message_class,
     similar_topics,
     subscribe_raw,
-    take_waiting,
 )
 
 NODE_NAME = 'beacon_node'
 GRAPH_PERIOD_S = 0.25
 REPORT_PERIOD_S = 1.0
-LONGEST_TURN_S = 0.01
-"""Messages are read for so long before the timers have their turn."""
+LONGEST_TURN_S = 0.005
+"""Messages are read, and waited for, for so long before the timers have their turn."""
 LOG_PERIOD_NS = NS_PER_S
 SILENCE_LOG_PERIOD_NS = 10 * NS_PER_S
 ACKNOWLEDGED_WITHIN = Duration(nanoseconds=NS_PER_S // 5)
@@ -119,6 +119,7 @@ class BeaconNode(Node):
         self._silence: Silence | None = None
         self._only_refused = False
         self._subscription: Subscription | None = None
+        self._queue: MessageQueue | None = None
         self._make_publishers()
         self._make_inputs()
         self._publish_confirmed()
@@ -160,15 +161,14 @@ class BeaconNode(Node):
 
     # --- inputs ---
 
+    @guarded
     def _on_message(self, cdr: bytes, info: dict[str, int]) -> None:
-        # A turn of the executor takes as long as reading a packet: messages that wait are read in the same one.
+        # A turn of the executor takes as long as reading a packet: messages that wait, or come soon, are read in the same one.
         stop_s = time.monotonic() + LONGEST_TURN_S
         self._read(cdr, info)
-        while time.monotonic() < stop_s and (waiting := self._next_waiting()) is not None:
-            self._read(*waiting)
-
-    def _next_waiting(self) -> tuple[bytes, dict[str, int]] | None:
-        return None if self._subscription is None else take_waiting(self._subscription)
+        while (left_s := stop_s - time.monotonic()) > 0.0 and self._queue is not None:
+            if (waiting := self._queue.take(left_s)) is not None:
+                self._read(*waiting)
 
     @guarded
     def _read(self, cdr: bytes, info: dict[str, int]) -> None:
@@ -179,20 +179,24 @@ class BeaconNode(Node):
             self._live.shed(self._now_ns())
             self.report.shed()
             return
-        step = self._live.push(cdr, self._now_ns())
+        step = self._live.push(cdr, self._now_ns(), lambda early: self._give(early, arrival_ns))
         self.report.message(step, waited_ns / NS_PER_S)
         if step.lost_packets:
             self.log_warning('lost', f'{self._topic}: {step.lost_packets} packets lost', time.monotonic_ns())
         if step.problem is not None:
             self.log_warning(step.problem_kind, f'{self._topic}: {step.problem}', time.monotonic_ns())
+        self._give(step, arrival_ns)
+        lag_ns = time.time_ns() - arrival_ns
+        self._shedder.read(lag_ns - waited_ns)
+        self.report.published(lag_ns / NS_PER_S)
+
+    @guarded
+    def _give(self, step: Step, arrival_ns: int) -> None:
+        """Publish what a message gave, or a part of it; it arrived at ``arrival_ns`` (ns, host)."""
         if step.end_ns is not None:
             self.report.latency.arrived(step.end_ns, arrival_ns)
         self._publish(step)
-        published_ns = time.time_ns()
-        self.report.latency.published(step.due_ns, published_ns)
-        lag_ns = published_ns - arrival_ns
-        self._shedder.read(lag_ns - waited_ns)
-        self.report.published(lag_ns / NS_PER_S)
+        self.report.latency.published(step.due_ns, time.time_ns())
 
     @guarded
     def _on_tick(self) -> None:
@@ -266,8 +270,9 @@ class BeaconNode(Node):
         if self._subscription is not None:
             # Before the other one comes: the middleware refuses two types of one topic in one process.
             self.destroy_subscription(self._subscription)
-            self._subscription, self._type = None, None
+            self._subscription, self._queue, self._type = None, None, None
         self._subscription = subscribe_raw(self, message_type, self._topic, self._on_message, self._qos, events)
+        self._queue = MessageQueue(self, self._subscription)
         self._type, self._not_installed = message_type, ''
         self._open_stream()
         self.get_logger().info(f'reading {self._topic} ({message_type})')

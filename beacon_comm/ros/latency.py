@@ -46,7 +46,12 @@ class CharacterLatency:
         self._latencies_ns: deque[int] = deque(maxlen=MOST_CHARACTERS)
 
     def arrived(self, end_ns: int, arrival_ns: int) -> None:
-        """Take notice of a packet that was read: the stream's time after it, and the host's when it arrived (ns)."""
+        """Take notice of a packet that was read: the stream's time after it, and the host's when it arrived (ns).
+
+        Only the first one that reaches a time counts.
+        """
+        if self._arrivals and end_ns == self._arrivals[-1][0]:
+            return
         if self._arrivals and end_ns < self._arrivals[-1][0]:
             self._arrivals.clear()  # the sensor's clock was restarted
         self._arrivals.append((end_ns, arrival_ns))

@@ -12,7 +12,8 @@ It knows no ROS: the node gives it bytes and the time, and publishes what it ret
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 from beacon_comm.core.bearing import CameraModel
 from beacon_comm.core.demodulator import decision_delay_bits
@@ -121,8 +122,16 @@ class LiveReceiver:
         self._restart()
         return self._step(now_ns)
 
-    def push(self, cdr: bytes, now_ns: int) -> Step:
-        """Take one message as it came over the wire."""
+    def push(self, cdr: bytes, now_ns: int, give: Callable[[Step], None] | None = None) -> Step:
+        """Take one message as it came over the wire.
+
+        Args:
+            cdr, now_ns: the message, and the node's clock (ns).
+            give: takes characters as soon as they are there; a hop's work need not be waited for.  It must not raise.
+
+        Returns:
+            What was not given.
+        """
         if self._stream is None:
             raise RuntimeError('no stream is open')
         decoded = self._stream.push(cdr)
@@ -131,9 +140,14 @@ class LiveReceiver:
         if decoded.batch is not None:
             receiver = self._follow(decoded)
             self._tie(decoded, decoded.batch, now_ns)
-            self._gather(receiver.push(self._time.admit(decoded.batch, now_ns)))
+            batch = self._time.admit(decoded.batch, now_ns)
+            for output in receiver.parts(batch):
+                self._gather(output)
+                if give is not None and self._gathered:
+                    give(self._step(now_ns, batch.t_end_ns))
             self._calm_down(receiver)
-        return self._step(now_ns, decoded)
+            return self._step(now_ns, batch.t_end_ns, decoded)
+        return self._step(now_ns, None, decoded)
 
     def shed(self, now_ns: int) -> None:
         """Pass a message over unread: there was no time for it.  What was in it is missing, not silent."""
@@ -257,13 +271,13 @@ class LiveReceiver:
         self._lost += output.lost
         self._confirmed_changed |= output.confirmed_changed
 
-    def _step(self, now_ns: int, decoded: Decoded | None = None) -> Step:
+    def _step(self, now_ns: int, end_ns: int | None = None, decoded: Decoded | None = None) -> Step:
         characters, lost, changed = tuple(self._gathered), tuple(self._lost), self._confirmed_changed
-        due_ns = tuple(self._due_ns)
+        due_ns = () if end_ns is None else tuple(self._due_ns)  # what a silence or the end decides was held by no message
         self._gathered, self._lost, self._confirmed_changed, self._due_ns = [], [], False, []
-        now = self.now(now_ns)
+        step = Step(self.now(now_ns), characters, lost, changed, end_ns=end_ns, due_ns=due_ns)
         if decoded is None:
-            return Step(now, characters, lost, changed)
-        kind = decoded.problem_kind or ''
-        end_ns = None if decoded.batch is None or self._receiver is None else self._receiver.t_ns
-        return Step(now, characters, lost, changed, decoded.problem, kind, decoded.lost_packets, end_ns, due_ns)
+            return step
+        return replace(
+            step, problem=decoded.problem, problem_kind=decoded.problem_kind or '', lost_packets=decoded.lost_packets
+        )

@@ -8,11 +8,13 @@ from importlib import import_module
 from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+from beacon_comm.core.events import NS_PER_S
 from beacon_comm.wire.stream import SUPPORTED_TYPES, is_event_array_type
 
 MAX_HINTS = 5
@@ -76,11 +78,32 @@ def subscribe_raw(
         return node.create_subscription(cls, topic, callback, qos, raw=True)
 
 
-def take_waiting(subscription: Subscription) -> tuple[bytes, dict[str, int]] | None:
-    """Return the message that waits longest in a raw subscription's queue, and its information; None if none waits."""
-    with subscription.handle:
-        taken: tuple[bytes, dict[str, int]] | None = subscription.handle.take_message(subscription.msg_type, subscription.raw)
-    return taken
+class MessageQueue:
+    """The messages that wait in a raw subscription's queue, and a wait for the next one that costs no turn of an executor.
+
+    A turn looks at every timer and subscription of the node and takes as long as reading a packet.
+    """
+
+    def __init__(self, node: Node, subscription: Subscription) -> None:
+        self._subscription = subscription
+        self._wait_set = _rclpy.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
+
+    def take(self, wait_s: float) -> tuple[bytes, dict[str, int]] | None:
+        """Return the message that waits longest, and its information; None if none comes within ``wait_s`` (s)."""
+        taken = self._take_one()
+        if taken is None and wait_s > 0.0:
+            self._wait_set.clear_entities()
+            self._wait_set.add_subscription(self._subscription.handle)
+            self._wait_set.wait(round(wait_s * NS_PER_S))
+            taken = self._take_one()
+        return taken
+
+    def _take_one(self) -> tuple[bytes, dict[str, int]] | None:
+        with self._subscription.handle:
+            taken: tuple[bytes, dict[str, int]] | None = self._subscription.handle.take_message(
+                self._subscription.msg_type, self._subscription.raw
+            )
+        return taken
 
 
 def find_publishers(node: Node, topic: str, qos: QoSProfile) -> Publishers:
