@@ -337,7 +337,7 @@ def _update(row, doubt, at_once):  # type: ignore[no-untyped-def]
     dt = (a * sums[3] + b * sums[7]) / weight
     side = (b * on - a * off) / weight  # 1: ON events alone, -1: OFF events
     vx, vy = row[VX], row[VY]
-    ahead_s = side * row[AHEAD]
+    ahead_s = side * row[AHEAD] if doubt == 1.0 else 0.0  # of two lights together nothing like that is known
     dx, dy = dx - ahead_s * vx, dy - ahead_s * vy
     spread = 0.5 * max(sums[8] - n * (dx * dx + dy * dy), 0.0)
     spread = max((spread + _PRIOR_EVENTS * 0.25 * row[EXTENT] ** 2) / (n + _PRIOR_EVENTS), _LEAST_SPREAD_PX2)
@@ -350,11 +350,11 @@ def _update(row, doubt, at_once):  # type: ignore[no-untyped-def]
         return False
     variance += 0.5 * lead2
     row[N_OFF : SINCE + 1] = 0.0
-    learnt_s = row[AHEAD] + _AHEAD_GAIN * side * (dx * vx + dy * vy) / (speed2 + _AHEAD_SPEED * _AHEAD_SPEED)
-    row[AHEAD] = min(max(learnt_s, 0.0), row[EXTENT] / (math.sqrt(speed2) + _AHEAD_SPEED))
     variance = _doubted(row, dt, dx, dy, variance)
     error, part = observe(row, dt, dx, dy, variance * doubt)
     if doubt == 1.0:
+        learnt_s = row[AHEAD] + _AHEAD_GAIN * side * (dx * vx + dy * vy) / (speed2 + _AHEAD_SPEED * _AHEAD_SPEED)
+        row[AHEAD] = min(max(learnt_s, 0.0), row[EXTENT] / (math.sqrt(speed2) + _AHEAD_SPEED))
         trust = row[TRUST] * math.exp(_TRUST_GAIN * part * (min(error, _MOST_ERROR) - 1.0))
         row[TRUST] = min(max(trust, _LEAST_TRUST), _MOST_TRUST)
     return True
