@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from beacon_comm.core.errors import ParameterError
 from beacon_comm.core.index_image import IndexImages, most_of_a_hop, whole_hops, window_hops
 from beacon_comm.core.parameters import Parameters
+from beacon_comm.core.routing import Router
 
 SIZE = (40, 30)
 
@@ -17,27 +18,28 @@ def hop_events(segment):
     return gathered(segment, SIZE)
 
 
-def expected_index(events, t_from, t_to, offset=10.0):
+def expected_index(events, t_from, t_to, offset=10.0, size=SIZE):
     """Return n / (B + |Σσ|) of the events in [t_from, t_to), pixel by pixel."""
     inside = (events.t_ns >= t_from) & (events.t_ns < t_to)
-    n, balance = np.zeros(SIZE[::-1]), np.zeros(SIZE[::-1])
+    n, balance = np.zeros(size[::-1]), np.zeros(size[::-1])
     np.add.at(n, (events.y[inside], events.x[inside]), 1)
     np.add.at(balance, (events.y[inside], events.x[inside]), events.polarity[inside])
     return n / (offset + np.abs(balance))
 
 
-@pytest.mark.parametrize(('threshold', 'offset'), [(0.6, 10.0), (2.0, 1.0)])  # above 1 a subtraction can list a pixel
-def test_sliding_windows_equal_counting_from_scratch(threshold, offset):
+# Above 1 a subtraction can list a pixel.
+@pytest.mark.parametrize(('threshold', 'offset', 'size'), [(0.6, 10.0, SIZE), (2.0, 1.0, SIZE), (0.6, 10.0, (130, 12))])
+def test_sliding_windows_equal_counting_from_scratch(threshold, offset, size):
     parameters = Parameters(bit_rates=(200.0, 3125.0), index_threshold=threshold, index_offset=offset)
-    images = IndexImages(parameters, SIZE)
+    images = IndexImages(parameters, size)
     assert [window.hops for window in images.windows] == [2, 11]
-    events = noise(*SIZE, rate_per_s=200_000, duration_s=0.3)
+    events = noise(*size, rate_per_s=200_000, duration_s=0.3)
     for segment in hops(events):
-        images.push(hop_events(segment))
+        images.push(gathered(segment, size))
         for window in images.windows:
             start = segment.t_end_ns - window.hops * HOP_NS
             np.testing.assert_array_equal(
-                images.index(window), expected_index(events, start, segment.t_end_ns, offset)
+                images.index(window), expected_index(events, start, segment.t_end_ns, offset, size)
             )
             assert window.events == images.counts(window).sum() == window.counts.sum()
             low = images.index(window) >= parameters.index_threshold / 2
@@ -77,6 +79,20 @@ def test_no_window_is_too_long_for_its_counts():
     assert most_of_a_hop(slow) * 1100 < 1 << 15 <= (most_of_a_hop(slow) + 1) * 1100
     with pytest.raises(ParameterError, match='long_window_bits'):
         Parameters(bit_rates=(20.0,), hop_s=0.001, long_window_bits=1000.0)
+
+
+def test_a_full_window_of_many_hops_runs_empty_again():
+    slow = Parameters(bit_rates=(20.0,), hop_s=0.001)
+    images, router, many = IndexImages(slow, SIZE), Router(slow, SIZE), 40
+    full = batch([7] * 2 * many, [3] * 2 * many, [1, -1] * many, np.full(2 * many, T0_NS))
+    for k in range(2 * 1100):
+        router.aim((), T0_NS)
+        router.route(full if k < 1100 else full.slice(0, 0, T0_NS))
+        images.push(router.close())
+        if k == 1099:
+            assert images.counts(images.windows[1])[:, 3, 7].tolist() == 2 * [1100 * most_of_a_hop(slow)]
+            assert images.low_pixels(images.windows[1]).sum() == 1
+    assert not any(window.counts.any() or window.low.any() for window in images.windows)
 
 
 def test_a_long_window_no_longer_than_the_short_one_is_not_kept():

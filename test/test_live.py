@@ -45,6 +45,7 @@ def test_characters_are_given_before_the_work_of_the_hop_that_ends_their_interva
         before += done[:2] == ['given', 'hop']
     assert before > 10
     assert early.characters() == whole.characters()
+    assert any(step.due_ns for step in early.steps)
     assert [due for step in early.steps for due in step.due_ns] == [due for step in whole.steps for due in step.due_ns]
     assert [step.confirmed_changed for step in whole.steps].count(True) == [
         step.confirmed_changed for step in early.steps

@@ -197,7 +197,7 @@ class BlobFinder:
         circle = np.stack((x, y, radius**2), axis=1)
         summed: NDArray[np.int64] = _sum_newest(
             newest.code, newest.offset_ns, self._grid.shift, cells_along(width), first, member, circle, self.owner
-        )  # fmt: skip
+        )
         return summed
 
 

@@ -20,7 +20,7 @@ one another off instead of passing through one another, and leave with each othe
 A light that moves while it is on gives ON events at its front and OFF events at its back.  So an observation is the middle
 between the means of both, and a burst of one polarity waits for some events of the other, if that makes a difference: if ON
 events are ahead, by what is learnt of each track as a time, from how far observations of more ON or more OFF events are off
-along its way.  What is not waited for is put right by that.
+along its way.  What is not waited for is put right by that.  Where two tracks share their events neither is done.
 
 The events of a track that moves by more than a share of its radius in a hop are hidden from the detection windows:
 there they would be a trail of it, in which false tracks begin.
@@ -335,14 +335,13 @@ def _update(row, doubt, at_once):  # type: ignore[no-untyped-def]
     weight = a * off + b * on
     dx, dy = (a * sums[1] + b * sums[5]) / weight, (a * sums[2] + b * sums[6]) / weight
     dt = (a * sums[3] + b * sums[7]) / weight
-    side = (b * on - a * off) / weight  # 1: ON events alone, -1: OFF events
-    vx, vy = row[VX], row[VY]
-    ahead_s = side * row[AHEAD] if doubt == 1.0 else 0.0  # of two lights together nothing like that is known
-    dx, dy = dx - ahead_s * vx, dy - ahead_s * vy
     spread = 0.5 * max(sums[8] - n * (dx * dx + dy * dy), 0.0)
     spread = max((spread + _PRIOR_EVENTS * 0.25 * row[EXTENT] ** 2) / (n + _PRIOR_EVENTS), _LEAST_SPREAD_PX2)
     few = (a * a * off + b * b * on) / (weight * weight)  # 1/n where all count alike
     variance = (row[TRUST] if n >= UPDATE_EVENTS else 1.0) * spread * few
+    side = (b * on - a * off) / weight  # 1: ON events alone, -1: OFF events
+    ahead_s = side * row[AHEAD] if doubt == 1.0 else 0.0  # not where the events of two lights are shared
+    vx, vy = row[VX], row[VY]
     speed2 = vx * vx + vy * vy
     lead2 = ahead_s * ahead_s * speed2
     one_sided = lead2 > _SMALL_LEAD * variance and abs(side) > _BALANCE
@@ -350,6 +349,7 @@ def _update(row, doubt, at_once):  # type: ignore[no-untyped-def]
         return False
     variance += 0.5 * lead2
     row[N_OFF : SINCE + 1] = 0.0
+    dx, dy = dx - ahead_s * vx, dy - ahead_s * vy
     variance = _doubted(row, dt, dx, dy, variance)
     error, part = observe(row, dt, dx, dy, variance * doubt)
     if doubt == 1.0:

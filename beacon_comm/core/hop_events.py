@@ -7,8 +7,8 @@ them on end are a *word*, as in the images of one bit a pixel.
     code     uint32  [ p: 30 bits | routed | on ]                            in the order of arrival
     counts   uint8   word after word that has events: 64 pixels' OFF events, then their ON events
 
-Events are counted as they arrive, so that a hop has no event to look at, but words.  A hop counts no more than so many
-events of a pixel and polarity.
+Events are counted as they arrive, so that the windows have words to look at, not events.  A hop counts no more than so
+many events of a pixel and polarity, 255 at most: one with more of both than that in a hop has the index of a balanced one.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class PixelGrid:
         width, height: of the sensor (px).
 
     Raises:
-        ValueError: a sensor that the words do not hold.
+        ValueError: a sensor whose pixels a code does not hold.
     """
 
     width: int

@@ -54,6 +54,7 @@ from beacon_comm.core.tracks import (
     EXTENT_RISE,
     FIRST_SPEED_PX_PER_S,
     FLOOR_PX,
+    KNOWN_AFTER_NS,
     SURPRISE,
     Covariance,
     Track,
@@ -74,10 +75,11 @@ _SAME_EXTENTS = 1.1  # two tracks of one blob are half a disc's centroids apart:
 _MERGE_UNREAD_S = 0.03  # a double that nobody has read yet has nothing to lose: before both are read …
 _NEW_S = 0.2  # … if it was a double soon after it began: what comes by later is another light
 # What is told of the error, calibrated on simulated scenes (docs/tracking.py, the part "errors").  Errors to the other side
-# cancel for longer than one observation; a prediction is better than the likely modes' accelerations say, the slower the
-# better.
-_CANCEL, _LEAST_SHARE, _VARIANCE_SHARE = 8.0, 0.1, 2.8
-_GROWTH_SHARE, _GROWTH_SPEED_PX_PER_S = 1.2, 1000.0
+# cancel for longer than one observation (the filter takes them to be independent, the part of the variance that does not
+# cancel is larger); a prediction is better than the likely modes' accelerations say, the slower the better, where it is one
+# from the last events to the next ones.
+_CANCEL, _LEAST_SHARE, _VARIANCE_FACTOR = 8.0, 0.1, 2.8
+_GROWTH_FACTOR, _GROWTH_SPEED_PX_PER_S, _LEAST_GROWTH_SHARE = 1.2, 1000.0, 0.01
 _JUMP_PX_PER_S, _JUMP_SHARE = 300.0, 0.3  # a velocity jumps by more than so much and this share of it …
 _JUMPED_S = 0.1  # … and what was before is remembered for so long
 _LIKE_EXTENT = 4.0  # what is so many times as large is something else
@@ -170,7 +172,9 @@ class MotionTrack(Track):
         speed = math.hypot(vx, vy)
         share = max(1.0 + _CANCEL * min(float(self.row[AGAIN]), 0.0), _LEAST_SHARE)
         variance, growth = motion.likely_variance(self.row, max(0, t_ns - self.t_ns) / NS_PER_S)
-        both = _VARIANCE_SHARE * share * variance + _GROWTH_SHARE * speed / (speed + _GROWTH_SPEED_PX_PER_S) * growth
+        followed = not self.quiet and self.last_seen_ns - self.first_seen_ns >= KNOWN_AFTER_NS
+        slow = max(_GROWTH_FACTOR * speed / (speed + _GROWTH_SPEED_PX_PER_S), _LEAST_GROWTH_SHARE)
+        both = _VARIANCE_FACTOR * share * variance + (slow if followed else 1.0) * growth
         both += _GRAIN_PX**2 / (1.0 + speed / _GRAIN_SPEED_PX_PER_S)
         along = (_LATENCY_SHARE * self.latency_s) ** 2
         cross = along * vx * vy

@@ -202,7 +202,7 @@ class Parameters(Declared):
     min_area_px: int = parameter(3, 'smallest blob', 'px', 1)
     max_area_px: int = parameter(10_000, 'largest blob', 'px', 1)
     window_max_bytes: int = parameter(
-        256_000_000, 'bound of the events kept for the windows; overflow is counted', 'byte', 1000
+        256_000_000, 'bound of the events kept for the windows, and of their counts; what is dropped is counted', 'byte', 1000
     )
 
     # Tracks
@@ -306,11 +306,11 @@ class Parameters(Declared):
             raise ParameterError(f'high_level = {self.high_level:g}: must be above |low_level| = {-self.low_level:g}')
         if self.levels == 'adaptive' and not self.high_share > self.low_share:
             raise ParameterError(f'high_share = {self.high_share:g}: must be above low_share = {self.low_share:g}')
-        longest_s = max(self.short_window_s, self.long_window_bits * self.slowest_bit_s)
-        if longest_s > MOST_WINDOW_HOPS * self.hop_s:
+        long_s = self.long_window_bits * self.slowest_bit_s
+        if long_s > MOST_WINDOW_HOPS * self.hop_s:
             raise ParameterError(
-                f'hop_s = {self.hop_s:g}, long_window_bits = {self.long_window_bits:g}: {longest_s:g} s are more than'
-                f' {MOST_WINDOW_HOPS} hops'
+                f'long_window_bits = {self.long_window_bits:g} of the slowest of bit_rates, {long_s:g} s, are more than'
+                f' {MOST_WINDOW_HOPS} times hop_s = {self.hop_s:g}'
             )
         if self.min_area_px > self.max_area_px:
             raise ParameterError(f'min_area_px = {self.min_area_px}: above max_area_px = {self.max_area_px}')

@@ -85,7 +85,7 @@ class BeaconSnapshot:
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """What one push gave.
+    """What one push, or a part of it, gave.
 
     Attributes:
         characters: decoded characters, those of each track in order of time; the order between tracks depends on
@@ -146,11 +146,12 @@ class Receiver:
 
         Batches must follow one another in time (see :mod:`beacon_comm.core.events`).
         """
+        before = self._confirmed
         parts = list(self.parts(batch))
         return Output(
             tuple(one for part in parts for one in part.characters),
             tuple(one for part in parts for one in part.lost),
-            any(part.confirmed_changed for part in parts),
+            self._confirmed != before,
         )
 
     def parts(self, batch: EventBatch) -> Iterator[Output]:

@@ -48,7 +48,7 @@ class Router:
     """Routes the events of a hop interval, and gathers them for the detection windows.
 
     Args:
-        parameters: ``routing_extent_factor``, ``routing_margin_px``, ``hop_s``.
+        parameters: ``routing_extent_factor``, ``routing_margin_px``, ``hop_s``, and those of the windows' lengths.
         sensor_size: width and height (px).
 
     Attributes:

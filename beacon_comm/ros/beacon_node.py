@@ -55,7 +55,7 @@ NODE_NAME = 'beacon_node'
 GRAPH_PERIOD_S = 0.25
 REPORT_PERIOD_S = 1.0
 LONGEST_TURN_S = 0.005
-"""Messages are read, and waited for, for so long before the timers have their turn."""
+"""Messages are read, and waited for, for so long before timers, /clock and the graph's news have their turn."""
 LOG_PERIOD_NS = NS_PER_S
 SILENCE_LOG_PERIOD_NS = 10 * NS_PER_S
 ACKNOWLEDGED_WITHIN = Duration(nanoseconds=NS_PER_S // 5)
@@ -338,6 +338,7 @@ class BeaconNode(Node):
     def close(self) -> None:
         """End the stream: publish what is still held, and wait a moment for it to arrive."""
         self._flush()
+        self._queue = None
         for publisher in (self._characters, self._text, self._confirmed):
             publisher.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
 

@@ -48,9 +48,9 @@ class CharacterLatency:
     def arrived(self, end_ns: int, arrival_ns: int) -> None:
         """Take notice of a packet that was read: the stream's time after it, and the host's when it arrived (ns).
 
-        Only the first one that reaches a time counts.
+        What it gave may be published in parts: it is noticed once.
         """
-        if self._arrivals and end_ns == self._arrivals[-1][0]:
+        if self._arrivals and (end_ns, arrival_ns) == self._arrivals[-1]:
             return
         if self._arrivals and end_ns < self._arrivals[-1][0]:
             self._arrivals.clear()  # the sensor's clock was restarted

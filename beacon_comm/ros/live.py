@@ -37,7 +37,7 @@ class Step:
     """What one message, one tick of a silent topic or the end of the stream gave.
 
     Attributes:
-        at: the stream's time after it.
+        at: the stream's time after it; of a part that is given early, that at its end.
         characters: in order of decision.
         lost: last snapshots of the tracks that were lost.
         confirmed_changed: the set of confirmed beacons is another one than before.
