@@ -20,7 +20,8 @@ one another off instead of passing through one another, and leave with each othe
 A light that moves while it is on gives ON events at its front and OFF events at its back.  So an observation is the middle
 between the means of both, and a burst of one polarity waits for some events of the other, if that makes a difference: if ON
 events are ahead, by what is learnt of each track as a time, from how far observations of more ON or more OFF events are off
-along its way.  What is not waited for is put right by that.  Where two tracks share their events neither is done.
+along its way.  What is not waited for is put right by that.  Where two tracks share their events neither is done, and of what is
+large, whose bursts are read out row by row, the means themselves tell how far apart they are.
 
 The events of a track that moves by more than a share of its radius in a hop are hidden from the detection windows:
 there they would be a trail of it, in which false tracks begin.
@@ -50,6 +51,7 @@ from beacon_comm.core.motion import (
     HOP_ON,
     HOP_RR,
     LAST,
+    LEAD2,
     LONG_OFF,
     LONG_ON,
     N_OFF,
@@ -83,6 +85,8 @@ _LEAST_SPAN_S = 1e-4  # … be it for so long or longer
 _TRUST_GAIN, _MOST_ERROR = 0.03, 5.0
 _LEAST_TRUST, _MOST_TRUST = 0.4, 10.0
 _SHARED = 2.0  # events that may be another track's tell so much less
+_EITHER = 12  # so many of either polarity tell how far they are apart
+_LEAD_GAIN = 0.05
 _AHEAD_GAIN = 0.01  # how fast it is learnt how far ON events are ahead …
 _AHEAD_SPEED = 100.0  # … of a light that moves by more than this (px/s)
 _DOUBTED = 9.0  # an observation so much farther off than expected (squared), and than what turns back since the last one, …
@@ -339,11 +343,16 @@ def _update(row, doubt, at_once):  # type: ignore[no-untyped-def]
     spread = max((spread + _PRIOR_EVENTS * 0.25 * row[EXTENT] ** 2) / (n + _PRIOR_EVENTS), _LEAST_SPREAD_PX2)
     few = (a * a * off + b * b * on) / (weight * weight)  # 1/n where all count alike
     variance = (row[TRUST] if n >= UPDATE_EVENTS else 1.0) * spread * few
+    if min(off, on) >= _EITHER:
+        lead_x, lead_y = 0.5 * (sums[5] / on - sums[1] / off), 0.5 * (sums[6] / on - sums[2] / off)
+        lead2 = lead_x * lead_x + lead_y * lead_y - 0.5 * spread * (1.0 / off + 1.0 / on)
+        row[LEAD2] += _LEAD_GAIN * (max(lead2, 0.0) - row[LEAD2])
     side = (b * on - a * off) / weight  # 1: ON events alone, -1: OFF events
-    ahead_s = side * row[AHEAD] if doubt == 1.0 else 0.0  # not where the events of two lights are shared
+    large = row[EXTENT] > _SHORTEST_PX
+    ahead_s = side * row[AHEAD] if doubt == 1.0 and not large else 0.0
     vx, vy = row[VX], row[VY]
     speed2 = vx * vx + vy * vy
-    lead2 = ahead_s * ahead_s * speed2
+    lead2 = row[LEAD2] * side * side if large else ahead_s * ahead_s * speed2
     one_sided = lead2 > _SMALL_LEAD * variance and abs(side) > _BALANCE
     if one_sided and n < _MOST_EVENTS and age_s < _LONGEST_WAIT_S and not at_once:
         return False

@@ -58,9 +58,10 @@ SUM_RR, SINCE = range(ON_T + 1, ON_T + 3)
 HOP_OFF, HOP_ON, HOP_RR, LAST = range(SINCE + 1, SINCE + 5)
 # ON and OFF events in windows that forget like the short and the long one.
 SHORT_ON, SHORT_OFF, LONG_ON, LONG_OFF = range(LAST + 1, LAST + 5)
-# Radius (px); whether the windows do not get its events; how many events a second are usual; how long ON events are ahead of
-# the middle of both polarities, and OFF events behind it (s); the variance of observations over what independent events have.
-EXTENT, HIDDEN, USUAL, AHEAD, TRUST = range(LONG_OFF + 1, LONG_OFF + 6)
+# Radius (px); whether the windows do not get its events; how many events a second are usual; how far ON and OFF events are from
+# the middle of both, squared (px²), and how long ON events are ahead of it along the way (s); the variance of observations over
+# what independent events have.
+EXTENT, HIDDEN, USUAL, LEAD2, AHEAD, TRUST = range(LONG_OFF + 1, LONG_OFF + 7)
 # The last observation's error over its standard deviation, and how much of it comes again in the next one.
 ERROR_X, ERROR_Y, AGAIN = range(TRUST + 1, TRUST + 4)
 # The last observation's residual (px) if it was doubted, else 0.
