@@ -20,8 +20,8 @@ one another off instead of passing through one another, and leave with each othe
 A light that moves while it is on gives ON events at its front and OFF events at its back.  So an observation is the middle
 between the means of both, and a burst of one polarity waits for some events of the other, if that makes a difference: if ON
 events are ahead, by what is learnt of each track as a time, from how far observations of more ON or more OFF events are off
-along its way.  What is not waited for is put right by that.  Where two tracks share their events neither is done, and of what is
-large, whose bursts are read out row by row, the means themselves tell how far apart they are.
+along its way.  What is not waited for is put right by that.  Where two tracks share their events neither is done, and of what
+is large, whose bursts are read out row by row, the means themselves tell how far apart they are.
 
 The events of a track that moves by more than a share of its radius in a hop are hidden from the detection windows:
 there they would be a trail of it, in which false tracks begin.
