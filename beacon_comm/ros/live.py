@@ -137,6 +137,7 @@ class LiveReceiver:
         decoded = self._stream.push(cdr)
         if decoded.restarted:
             self._restart()
+        end_ns = None
         if decoded.batch is not None:
             receiver = self._follow(decoded)
             self._tie(decoded, decoded.batch, now_ns)
@@ -146,8 +147,13 @@ class LiveReceiver:
                 if give is not None and self._gathered:
                     give(self._step(now_ns, batch.t_end_ns))
             self._calm_down(receiver)
-            return self._step(now_ns, batch.t_end_ns, decoded)
-        return self._step(now_ns, None, decoded)
+            end_ns = batch.t_end_ns
+        return replace(
+            self._step(now_ns, end_ns),
+            problem=decoded.problem,
+            problem_kind=decoded.problem_kind or '',
+            lost_packets=decoded.lost_packets,
+        )
 
     def shed(self, now_ns: int) -> None:
         """Pass a message over unread: there was no time for it.  What was in it is missing, not silent."""
@@ -271,13 +277,8 @@ class LiveReceiver:
         self._lost += output.lost
         self._confirmed_changed |= output.confirmed_changed
 
-    def _step(self, now_ns: int, end_ns: int | None = None, decoded: Decoded | None = None) -> Step:
+    def _step(self, now_ns: int, end_ns: int | None = None) -> Step:
         characters, lost, changed = tuple(self._gathered), tuple(self._lost), self._confirmed_changed
         due_ns = () if end_ns is None else tuple(self._due_ns)  # what a silence or the end decides was held by no message
         self._gathered, self._lost, self._confirmed_changed, self._due_ns = [], [], False, []
-        step = Step(self.now(now_ns), characters, lost, changed, end_ns=end_ns, due_ns=due_ns)
-        if decoded is None:
-            return step
-        return replace(
-            step, problem=decoded.problem, problem_kind=decoded.problem_kind or '', lost_packets=decoded.lost_packets
-        )
+        return Step(self.now(now_ns), characters, lost, changed, end_ns=end_ns, due_ns=due_ns)
