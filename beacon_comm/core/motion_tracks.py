@@ -54,7 +54,6 @@ from beacon_comm.core.tracks import (
     EXTENT_RISE,
     FIRST_SPEED_PX_PER_S,
     FLOOR_PX,
-    KNOWN_AFTER_NS,
     SURPRISE,
     Covariance,
     Track,
@@ -172,7 +171,7 @@ class MotionTrack(Track):
         speed = math.hypot(vx, vy)
         share = max(1.0 + _CANCEL * min(float(self.row[AGAIN]), 0.0), _LEAST_SHARE)
         variance, growth = motion.likely_variance(self.row, max(0, t_ns - self.t_ns) / NS_PER_S)
-        followed = not self.quiet and self.last_seen_ns - self.first_seen_ns >= KNOWN_AFTER_NS
+        followed = not self.quiet and self.has_known_velocity
         slow = max(_GROWTH_FACTOR * speed / (speed + _GROWTH_SPEED_PX_PER_S), _LEAST_GROWTH_SHARE)
         both = _VARIANCE_FACTOR * share * variance + (slow if followed else 1.0) * growth
         both += _GRAIN_PX**2 / (1.0 + speed / _GRAIN_SPEED_PX_PER_S)

@@ -37,7 +37,7 @@ STEADY_S = 0.1  # a prediction goes on unchanged for this long …
 FADE_S = 1.0  # … and then fades with this time constant
 _ACCELERATION = 400.0  # white acceleration of the filter (px²/s³): 2 px/s more uncertain after 10 ms
 FIRST_SPEED_PX_PER_S = 200.0  # standard deviation of an unknown velocity
-KNOWN_AFTER_NS = 100_000_000  # a velocity seen for less long is not gone on with
+_KNOWN_AFTER_NS = 100_000_000  # a velocity seen for less long is not gone on with
 FLOOR_PX = 0.05  # an observation is never better than this
 SURPRISE = 16.0  # an innovation of more than 4 standard deviations is a manoeuvre
 _SAME_RATE = 0.02  # the same beacon's bit rates differ by less
@@ -152,8 +152,12 @@ class Track:
     def certain_share(self) -> float:
         """Return which share of the velocity is certain."""
         speed2 = self.vx_px_per_s**2 + self.vy_px_per_s**2
-        known = speed2 > 0 and self.last_seen_ns - self.first_seen_ns >= KNOWN_AFTER_NS
-        return max(0.0, 1.0 - 8.0 * self.variance[2] / speed2) if known else 0.0
+        return max(0.0, 1.0 - 8.0 * self.variance[2] / speed2) if speed2 > 0 and self.has_known_velocity else 0.0
+
+    @property
+    def has_known_velocity(self) -> bool:
+        """Whether it has been seen for long enough for its velocity to be gone on with."""
+        return self.last_seen_ns - self.first_seen_ns >= _KNOWN_AFTER_NS
 
     def stop(self, x_px: float, y_px: float, t_ns: int) -> None:
         """Wait at a place from ``t_ns`` (ns) on."""
