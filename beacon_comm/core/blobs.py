@@ -39,8 +39,8 @@ from beacon_comm.core.components import (
     ComponentSet,
     paint,
 )  # fmt: skip
-from beacon_comm.core.hop_events import CODE_BITS, WORD_SHIFT, HopEvents, PixelGrid
-from beacon_comm.core.index_image import IndexImages, Window, hop_length_ns
+from beacon_comm.core.hop_events import CODE_BITS, HopEvents, PixelGrid
+from beacon_comm.core.index_image import IndexImages, Window, hop_length_ns, pixel_counts
 from beacon_comm.core.nearest import CELL_SHIFT, cell_lists, cells_along
 from beacon_comm.core.parameters import Parameters
 
@@ -229,8 +229,8 @@ def _long_stands(run, first, fits, short_label, short_fits, short_counts):  # ty
         count_in = count_out = np.int64(0)
         for k in range(first[c], first[c + 1]):
             for p in range(run[k, 0], run[k, 1]):
-                word, place = p >> WORD_SHIFT, p & 63
-                n = np.int64(short_counts[word, 0, place]) + np.int64(short_counts[word, 1, place])
+                off, on = pixel_counts(short_counts, p)
+                n = off + on
                 s = short_label[p] - 1
                 if s >= 0 and short_fits[s]:
                     area_in += 1

@@ -20,7 +20,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from beacon_comm.core.hop_events import WORD_SHIFT, PixelGrid
-from beacon_comm.core.index_image import Window
+from beacon_comm.core.index_image import Window, pixel_counts
 from beacon_comm.core.parameters import Parameters
 
 # Columns of ComponentSet.sums.
@@ -308,7 +308,7 @@ def _sum_run(start, stop, left, counts, threshold, offset, index_sum):  # type: 
     n_sum = x_sum = xx_sum = np.int64(0)
     seeds = 0
     for p in range(start, stop):
-        off, on = np.int64(counts[p >> WORD_SHIFT, 0, p & 63]), np.int64(counts[p >> WORD_SHIFT, 1, p & 63])
+        off, on = pixel_counts(counts, p)
         n, base = on + off, offset + abs(on - off)
         x = left + p - start
         n_sum += n

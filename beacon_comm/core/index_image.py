@@ -174,6 +174,13 @@ def hop_length_ns(parameters: Parameters) -> int:
 
 
 @njit(cache=True, nogil=True)
+def pixel_counts(counts, pixel):  # type: ignore[no-untyped-def]
+    """Return how many OFF and ON events of a pixel a window's ``counts`` hold."""
+    word, place = pixel >> WORD_SHIFT, pixel & (_WORD - 1)
+    return np.int64(counts[word, 0, place]), np.int64(counts[word, 1, place])
+
+
+@njit(cache=True, nogil=True)
 def _slide(gone_words, gone, came_words, came, low, offset, counts, low_bits):  # type: ignore[no-untyped-def]
     """Take the counts that leave off and add those that come, word by word; find the low pixels of these words again."""
     fewest = min(max(1.0, np.ceil(low * offset)), 65535.0)
