@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from beacon_comm.core.blobs import BlobFinder
 from beacon_comm.core.components import AREA, BOTTOM, COUNT, LEFT, RIGHT, SEEDS, TOP, ComponentFinder
-from beacon_comm.core.hop_events import CODE_BITS, ON, WORD_COUNTS, WORD_SHIFT, PixelGrid
+from beacon_comm.core.hop_events import CODE_BITS, ON, PixelGrid
 from beacon_comm.core.index_image import IndexImages
 from beacon_comm.core.parameters import Parameters
 
@@ -180,7 +180,7 @@ def test_noise_makes_no_blob():
     assert not any(blobs for _, blobs in found)
 
 
-def test_the_router_lists_the_events_and_counts_them_word_by_word():
+def test_the_router_lists_the_events_and_counts_them_by_bit_planes():
     size = (600, 300)
     segment = next(iter(hops(noise(*size, 1_000_000, 0.005))))
     events, grid = gathered(segment, size), PixelGrid(*size)
@@ -189,8 +189,12 @@ def test_the_router_lists_the_events_and_counts_them_word_by_word():
     np.testing.assert_array_equal(y, segment.y)
     np.testing.assert_array_equal((events.code & ON) > 0, segment.polarity > 0)
     np.testing.assert_array_equal(events.t_start_ns + events.offset_ns.astype(np.int64), segment.t_ns)
-    counts = np.zeros((300, grid.stride >> WORD_SHIFT, 2, 1 << WORD_SHIFT), np.int64)
-    np.add.at(counts, (segment.y, segment.x >> WORD_SHIFT, (segment.polarity > 0).astype(int), segment.x & 63), 1)
-    by_word = counts.reshape(-1, WORD_COUNTS)
-    np.testing.assert_array_equal(events.words, np.flatnonzero(by_word.any(axis=1)))
-    np.testing.assert_array_equal(events.counts, by_word[events.words])
+    counts = np.zeros((2, *size[::-1]), np.int64)
+    np.add.at(counts, ((segment.polarity > 0).astype(int), segment.y, segment.x), 1)
+    rows = np.flatnonzero(counts.any(axis=(0, 2)))
+    np.testing.assert_array_equal(events.rows, rows)
+    for k, y in enumerate(rows):
+        planes = events.planes[events.first[k] : events.first[k + 1]].reshape(-1, 2, grid.words)
+        bits = np.unpackbits(planes.astype('<u8').view(np.uint8), axis=-1, bitorder='little')[..., : size[0]]
+        np.testing.assert_array_equal(np.tensordot(1 << np.arange(len(bits)), bits, (0, 0)), counts[:, y])
+        assert planes[-1].any()

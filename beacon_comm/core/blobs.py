@@ -41,7 +41,7 @@ from beacon_comm.core.components import (
 )  # fmt: skip
 from beacon_comm.core.hop_events import CODE_BITS, HopEvents, PixelGrid
 from beacon_comm.core.index_image import IndexImages, Window, hop_length_ns, pixel_counts
-from beacon_comm.core.nearest import CELL_SHIFT, cell_lists, cells_along
+from beacon_comm.core.nearest import CELL_SHIFT, cell_lists, cells_along, cells_with_members
 from beacon_comm.core.parameters import Parameters
 
 _FRESH_EVENTS = 4  # fewer new events say nothing about the position …
@@ -139,7 +139,7 @@ class BlobFinder:
         if len(self._sets) > 1:
             long = self._sets[1]
             stands[1] &= _long_stands(
-                long.run, long.first, stands[1], short.label, stands[0], windows[0].counts
+                long.run, long.first, stands[1], short.label, stands[0], windows[0].planes, windows[0].used, self._grid.shift
             )
         chosen = [np.flatnonzero(which) for which in stands]
         number = np.where(short.sums[:, AREA] > p.max_area_px, -1, 0)
@@ -219,8 +219,11 @@ def _own(run, first, number, owner):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _long_stands(run, first, fits, short_label, short_fits, short_counts):  # type: ignore[no-untyped-def]
-    """Return which components of the long window stand; the short ones they stand for stop standing."""
+def _long_stands(run, first, fits, short_label, short_fits, planes, used, shift):  # type: ignore[no-untyped-def]
+    """Return which components of the long window stand; the short ones they stand for stop standing.
+
+    ``planes``, ``used``: of the short window.
+    """
     stands = np.zeros(len(fits), np.bool_)
     for c in range(len(fits)):
         if not fits[c]:
@@ -228,8 +231,9 @@ def _long_stands(run, first, fits, short_label, short_fits, short_counts):  # ty
         area_in = area_out = 0
         count_in = count_out = np.int64(0)
         for k in range(first[c], first[c + 1]):
+            y = run[k, 0] >> shift
             for p in range(run[k, 0], run[k, 1]):
-                off, on = pixel_counts(short_counts, p)
+                off, on = pixel_counts(planes, used, y, p - (y << shift))
                 n = off + on
                 s = short_label[p] - 1
                 if s >= 0 and short_fits[s]:
@@ -254,18 +258,25 @@ def _long_stands(run, first, fits, short_label, short_fits, short_counts):  # ty
 def _sum_newest(code, offset_ns, shift, cells_across, first, member, circle, owner):  # type: ignore[no-untyped-def]
     """Sum up the newest events of each blob; see :meth:`BlobFinder._sum_newest`."""
     sums = np.zeros((len(circle), 5), np.int64)
+    has_circle = cells_with_members(first)
+    index = np.empty(len(code), np.int32)
+    row_shift, column_shift = np.uint32(CODE_BITS + shift + CELL_SHIFT), np.uint32(CODE_BITS + CELL_SHIFT)
+    columns = np.uint32((1 << (shift - CELL_SHIFT)) - 1)
+    near = np.uint64(0)  # unsigned, so that no place is taken to count from the end
     for i in range(len(code)):
-        p = np.int64(code[i] >> np.uint32(CODE_BITS))
+        cell = np.uint64(code[i] >> row_shift) * np.uint64(cells_across) + np.uint64((code[i] >> column_shift) & columns)
+        index[near] = i
+        near += np.uint64(has_circle[cell])
+    for j in range(near):
+        event = np.uint64(index[j])
+        p = np.int64(code[event] >> np.uint32(CODE_BITS))
         y = p >> shift
         x = p - (y << shift)
-        cell = np.uint64((y >> CELL_SHIFT) * cells_across + (x >> CELL_SHIFT))
-        begin, end = np.uint64(first[cell]), np.uint64(first[cell + np.uint64(1)])
-        if begin == end:
-            continue
         b = np.int64(owner[p]) - 1
         if b == -1:
+            cell = np.uint64((y >> CELL_SHIFT) * cells_across + (x >> CELL_SHIFT))
             nearest2 = np.inf
-            for k in range(begin, end):
+            for k in range(np.uint64(first[cell]), np.uint64(first[cell + np.uint64(1)])):
                 m = np.uint64(member[k])
                 dx, dy = x - circle[m, 0], y - circle[m, 1]
                 d2 = dx * dx + dy * dy
@@ -277,5 +288,5 @@ def _sum_newest(code, offset_ns, shift, cells_across, first, member, circle, own
             sums[b, 1] += x
             sums[b, 2] += y
             sums[b, 3] += x * x + y * y
-            sums[b, 4] += offset_ns[i]
+            sums[b, 4] += offset_ns[event]
     return sums

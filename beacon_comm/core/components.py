@@ -70,9 +70,8 @@ class ComponentFinder:
         self._threshold = parameters.index_threshold
         self._offset = parameters.index_offset
         self._closing_px = parameters.closing_px
-        words = ((grid.width - 1) >> WORD_SHIFT) + 1
-        self._wide = np.zeros((grid.height, words), np.uint64)
-        self._closed = np.zeros((grid.height, words), np.uint64)
+        self._wide = np.zeros((grid.height, grid.words), np.uint64)
+        self._closed = np.zeros((grid.height, grid.words), np.uint64)
         self._label = np.zeros(grid.numbers, np.int32)
         self._run = np.empty((0, 2), np.int32)
 
@@ -84,7 +83,7 @@ class ComponentFinder:
             _close(bits, self._closing_px, self._grid.width, self._wide, self._closed)
             bits = self._closed
         self._run, first, sums, index = _find_components(
-            bits, self._grid.width, self._grid.shift, window.counts, self._threshold, self._offset, self._label
+            bits, self._grid.width, self._grid.shift, window.planes, window.used, self._threshold, self._offset, self._label
         )
         return ComponentSet(self._label, self._run, first, sums, index)
 
@@ -268,7 +267,7 @@ def _join_runs(run, row_first, stride):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _find_components(bits, width, shift, counts, threshold, offset, label):  # type: ignore[no-untyped-def]
+def _find_components(bits, width, shift, planes, used, threshold, offset, label):  # type: ignore[no-untyped-def]
     """Join the runs of a set, sum each component up, label its pixels; return runs, first, sums, index."""
     found, row_first = _find_runs(bits, width, shift)
     number, m = _join_runs(found, row_first, 1 << shift)
@@ -278,7 +277,7 @@ def _find_components(bits, width, shift, counts, threshold, offset, label):  # t
         c, start, stop = number[k], np.int64(found[k, 0]), np.int64(found[k, 1])
         y = start >> shift
         left, right = start - (y << shift), stop - 1 - (y << shift)
-        n, x_sum, xx_sum, seeds, index[c] = _sum_run(start, stop, left, counts, threshold, offset, index[c])
+        n, x_sum, xx_sum, seeds, index[c] = _sum_run(y, left, right, planes, used, threshold, offset, index[c])
         sums[c, AREA] += stop - start
         sums[c, SEEDS] += seeds
         sums[c, COUNT] += n
@@ -303,14 +302,13 @@ def _find_components(bits, width, shift, counts, threshold, offset, label):  # t
 
 
 @njit(cache=True, nogil=True)
-def _sum_run(start, stop, left, counts, threshold, offset, index_sum):  # type: ignore[no-untyped-def]
+def _sum_run(y, left, right, planes, used, threshold, offset, index_sum):  # type: ignore[no-untyped-def]
     """Return n, Σ n x, Σ n x² and the seeds of a run, and its component's index sum with the run's."""
     n_sum = x_sum = xx_sum = np.int64(0)
     seeds = 0
-    for p in range(start, stop):
-        off, on = pixel_counts(counts, p)
+    for x in range(left, right + 1):
+        off, on = pixel_counts(planes, used, y, x)
         n, base = on + off, offset + abs(on - off)
-        x = left + p - start
         n_sum += n
         x_sum += n * x
         xx_sum += n * x * x

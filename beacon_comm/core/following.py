@@ -70,7 +70,7 @@ from beacon_comm.core.motion import (
     variance_at,
 )  # fmt: skip
 from beacon_comm.core.motion_tracks import MotionTrack
-from beacon_comm.core.nearest import CELL_SHIFT, list_cells
+from beacon_comm.core.nearest import CELL_SHIFT, cells_with_members, list_cells
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.routing import Router, cell_of
 from beacon_comm.core.tracks import Track
@@ -169,6 +169,7 @@ def _follow(  # type: ignore[no-untyped-def]
     """List the events that are of a track, with their tracks; move the tracks on; return how many, and the cells' lists."""
     across, down = ((width - 1) >> CELL_SHIFT) + 1, ((height - 1) >> CELL_SHIFT) + 1
     step_s = step_ns * 1e-9
+    has_path = cells_with_members(first)
     routed = np.int64(0)
     i = np.int64(0)
     while i < len(x):
@@ -183,13 +184,13 @@ def _follow(  # type: ignore[no-untyped-def]
             _find_partners(path, rank, state, partner)
             if not fits:
                 first, member = _list_paths(path, step_s, width, height, across, down)
+                has_path = cells_with_members(first)
         stop = i + np.searchsorted(t_ns[i:], t_hop_ns + (now + 1) * step_ns)
         base = routed
         near = np.uint64(base)  # unsigned, so that no place is taken to count from the end
         for one in range(i, stop):
-            cell = cell_of(x[one], y[one], across)
             index[near] = one
-            near += np.uint64(first[cell] != first[cell + np.uint64(1)])
+            near += np.uint64(has_path[cell_of(x[one], y[one], across)])
         i = stop
         for j in range(np.uint64(base), near):
             e = np.uint64(index[j])
@@ -236,6 +237,7 @@ def _follow(  # type: ignore[no-untyped-def]
                 fits &= _is_in_box(path[best], step_s)
             if not fits:
                 first, member = _list_paths(path, step_s, width, height, across, down)
+                has_path = cells_with_members(first)
                 i = np.int64(e) + 1  # what is near is another question now
                 break
     return routed, first, member

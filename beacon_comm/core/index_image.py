@@ -11,17 +11,14 @@ All windows lie on one grid of hops that is absolute in event time and end at th
     long               '-------------------------------'     long_window_bits of the slowest bit rate
     short                              '---------------'     short_window_s
 
-A window is kept as one count image, 64 pixels' OFF events, then their ON events, then the next 64 pixels
-(:mod:`.hop_events` numbers them and counts each hop alike):
+A window is kept as bit planes of its pixels' counts (:mod:`.hop_events` numbers them and counts each hop alike):
 
-    counts  uint16  [off × 64 | on × 64 | off × 64 | …]        n = on + off, Σσ = on - off
+    planes  uint64  row after row: [bit 0 of OFF | bit 0 of ON | bit 1 of OFF | …]        n = on + off, Σσ = on - off
 
-A hop adds its counts and subtracts those of the hop that leaves, word by word of 64 pixels that has any, and looks there
-for the pixels above the lower threshold (index_grow_share × index_threshold): its cost is that of the words with
-events, whatever their number.  These pixels are one bit each, 64 to a word, as the next stage takes them.
-
-A hop counts no more events of a pixel and polarity than any window of such hops can hold, and at most 255
-(:func:`most_of_a_hop`).
+A hop adds its counts and subtracts those of the hop that leaves, plane by plane until no carry is left, a row at a time and
+only rows that have any.  There it looks for the pixels with as many events as the lower threshold
+(index_grow_share × index_threshold) takes at least, again plane by plane, and only for these at I.  Those above the threshold
+are one bit each, 64 to a word, as the next stage takes them.
 """
 
 from __future__ import annotations
@@ -36,11 +33,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from beacon_comm.core.events import NS_PER_S
-from beacon_comm.core.hop_events import WORD_COUNTS, WORD_SHIFT, HopEvents, PixelGrid, no_events
-from beacon_comm.core.parameters import MOST_WINDOW_HOPS, Parameters
+from beacon_comm.core.hop_events import HOP_PLANES, WORD_SHIFT, HopEvents, PixelGrid, no_events
+from beacon_comm.core.parameters import Parameters
 
 _WORD = 1 << WORD_SHIFT
-_GATHER = np.uint64(0x0102_0408_1020_4080)  # times eight bytes of 0 or 1: the upper byte has them as bits
+_ALL, _NONE = np.uint64(0xFFFF_FFFF_FFFF_FFFF), np.uint64(0)
+_MOST_EVENTS = 1 << 40  # no window has more
 
 
 @dataclass(slots=True)
@@ -49,14 +47,17 @@ class Window:
 
     Attributes:
         hops: its length.
-        counts: OFF, then ON events of every pixel, word by word, ``(words, 2, 64)`` uint16; see the module's head.
+        planes: bits of the OFF, then of the ON events of every pixel, ``(height, planes, 2, words)`` uint64; see the module's
+            head.
+        used: how many planes of a row may have bits, ``(height,)`` int64.
         low: whether a pixel is above the lower threshold, row by row, ``(height, stride / 64)`` uint64, bit x % 64 of
             word x / 64.
         events: events in the window.
     """
 
     hops: int
-    counts: NDArray[np.uint16]
+    planes: NDArray[np.uint64]
+    used: NDArray[np.int64]
     low: NDArray[np.uint64]
     events: int = 0
 
@@ -87,9 +88,10 @@ class IndexImages:
         self.overflow_events = 0
 
     def _empty_window(self, hops: int) -> Window:
-        counts = np.zeros((self.grid.numbers >> WORD_SHIFT, 2, _WORD), np.uint16)
-        low = np.zeros((self.grid.height, self.grid.stride >> WORD_SHIFT), np.uint64)
-        return Window(hops, counts, low)
+        height, words = self.grid.height, self.grid.words
+        planes = np.zeros((height, HOP_PLANES + hops.bit_length(), 2, words), np.uint64)
+        low = np.zeros((height, self.grid.stride >> WORD_SHIFT), np.uint64)
+        return Window(hops, planes, np.zeros(height, np.int64), low)
 
     @property
     def empty(self) -> bool:
@@ -129,8 +131,8 @@ class IndexImages:
     def _slide(self, window: Window, leaving: HopEvents, coming: HopEvents) -> None:
         if len(leaving) or len(coming):
             _slide(
-                leaving.words, leaving.counts, coming.words, coming.counts, self._low, self._offset,
-                window.counts.reshape(-1), window.low.reshape(-1),
+                leaving.rows, leaving.first, leaving.planes, coming.rows, coming.first, coming.planes, self._low, self._offset,
+                window.planes, window.used, window.low,
             )  # fmt: skip
             window.events += len(coming) - len(leaving)
 
@@ -140,10 +142,10 @@ class IndexImages:
         index: NDArray[np.float64] = (on + off) / (self._offset + np.abs(on - off))
         return index
 
-    def counts(self, window: Window) -> NDArray[np.uint16]:
-        """Return the OFF, then the ON events of the sensor's pixels, ``(2, height, width)`` uint16."""
-        rows = window.counts.reshape(self.grid.height, -1, 2, _WORD).transpose(2, 0, 1, 3)
-        return rows.reshape(2, self.grid.height, -1)[:, :, : self.grid.width]
+    def counts(self, window: Window) -> NDArray[np.int64]:
+        """Return the OFF, then the ON events of the sensor's pixels, ``(2, height, width)`` int64."""
+        bits = np.unpackbits(window.planes.astype('<u8').view(np.uint8), axis=-1, bitorder='little')[..., : self.grid.width]
+        return np.tensordot(1 << np.arange(bits.shape[1]), bits, (0, 1)).transpose(1, 0, 2)
 
     def low_pixels(self, window: Window) -> NDArray[np.bool_]:
         """Return which pixels are above the lower threshold, ``(height, width)`` bool."""
@@ -163,64 +165,135 @@ def window_hops(parameters: Parameters) -> tuple[int, ...]:
     return (short, long) if long > short else (short,)
 
 
-def most_of_a_hop(parameters: Parameters) -> int:
-    """Return how many events of a pixel and polarity a hop counts: twice those of a whole window fit 16 bits."""
-    return min(255, MOST_WINDOW_HOPS // window_hops(parameters)[-1])
-
-
 def hop_length_ns(parameters: Parameters) -> int:
     """Return the spacing of the hop grid (ns)."""
     return round(parameters.hop_s * NS_PER_S)
 
 
 @njit(cache=True, nogil=True)
-def pixel_counts(counts, pixel):  # type: ignore[no-untyped-def]
-    """Return how many OFF and ON events of a pixel a window's ``counts`` hold."""
-    word, place = pixel >> WORD_SHIFT, pixel & (_WORD - 1)
-    return np.int64(counts[word, 0, place]), np.int64(counts[word, 1, place])
+def pixel_counts(planes, used, y, x):  # type: ignore[no-untyped-def]
+    """Return how many OFF and ON events of a pixel a window's ``planes`` hold."""
+    word, place = x >> WORD_SHIFT, np.uint64(x & (_WORD - 1))
+    off, on = _NONE, _NONE
+    for plane in range(used[y]):
+        off |= ((planes[y, plane, 0, word] >> place) & np.uint64(1)) << np.uint64(plane)
+        on |= ((planes[y, plane, 1, word] >> place) & np.uint64(1)) << np.uint64(plane)
+    return np.int64(off), np.int64(on)
 
 
 @njit(cache=True, nogil=True)
-def _slide(gone_words, gone, came_words, came, low, offset, counts, low_bits):  # type: ignore[no-untyped-def]
-    """Take the counts that leave off and add those that come, word by word; find the low pixels of these words again."""
-    fewest = min(max(1.0, np.ceil(low * offset)), 65535.0)
-    is_low = np.empty(_WORD, np.uint8)
-    eight = is_low.view(np.uint64)
-    i, j = np.uint64(0), np.uint64(0)
-    while i < len(gone_words) or j < len(came_words):
-        goes = i < len(gone_words) and (j >= len(came_words) or gone_words[i] <= came_words[j])
-        comes = j < len(came_words) and (i >= len(gone_words) or came_words[j] <= gone_words[i])
-        word = np.uint64(came_words[j]) if comes else np.uint64(gone_words[i])
-        at = word * np.uint64(WORD_COUNTS)
+def _slide(  # type: ignore[no-untyped-def]
+    gone_rows, gone_first, gone, came_rows, came_first, came, low, offset, planes, used, low_bits
+):
+    """Take the counts that leave off and add those that come, row by row; find the low pixels of these rows again."""
+    fewest = np.int64(min(max(1.0, np.ceil(low * offset)), float(_MOST_EVENTS)))
+    depth, words = planes.shape[1], planes.shape[3]
+    flat = planes.reshape(-1)
+    carry, many = np.empty(2 * words, np.uint64), np.empty(words, np.uint64)
+    counts, is_low = np.empty((2, _WORD), np.int64), np.empty(_WORD, np.uint64)
+    i = j = 0
+    while i < len(gone_rows) or j < len(came_rows):
+        goes = i < len(gone_rows) and (j >= len(came_rows) or gone_rows[i] <= came_rows[j])
+        comes = j < len(came_rows) and (i >= len(gone_rows) or came_rows[j] <= gone_rows[i])
+        y = came_rows[j] if comes else gone_rows[i]
+        row = np.uint64(y * depth * 2 * words)
         if goes:
-            for k in range(WORD_COUNTS):
-                counts[at + np.uint64(k)] -= gone[i, k]
-            i += np.uint64(1)
+            _change(flat, row, gone, gone_first[i], gone_first[i + 1], _ALL, carry)
+            i += 1
         if comes:
-            for k in range(WORD_COUNTS):
-                counts[at + np.uint64(k)] += came[j, k]
-            j += np.uint64(1)
-        found = np.uint64(0)
-        if _most(counts, at) >= fewest:
-            _find_low(counts, at, low, offset, is_low)
-            for byte in range(8):
-                found |= ((eight[byte] * _GATHER) >> np.uint64(56)) << np.uint64(8 * byte)
-        low_bits[word] = found
+            changed = _change(flat, row, came, came_first[j], came_first[j + 1], _NONE, carry)
+            used[y] = max(used[y], changed)
+            j += 1
+        used[y] = _find_many(flat, row, used[y], fewest, many, carry)
+        for word in range(words):
+            low_bits[y, word] = _NONE
+            if many[word]:
+                _unpack(planes[y, :, :, word], used[y], counts)
+                low_bits[y, word] = _find_low(counts, low, offset, is_low)
 
 
 @njit(cache=True, nogil=True)
-def _most(counts, at):  # type: ignore[no-untyped-def]
-    """Return the most events that a pixel of a word has."""
-    most = np.uint16(0)
-    for k in range(_WORD):
-        most = max(most, np.uint16(counts[at + np.uint64(k)] + counts[at + np.uint64(_WORD + k)]))
-    return most
+def _change(planes, row, by, start, stop, flip, carry):  # type: ignore[no-untyped-def]
+    """Add the counts ``by[start:stop]`` to a row's, or take them off: ``flip`` 0, or all bits; return how many planes changed.
+
+    Both carry alike, but that a difference borrows where the bit that it is taken off is not set.
+    """
+    width = np.uint64(len(carry))
+    for k in range(width):
+        carry[k] = _NONE
+    at, of = row, np.uint64(start)
+    while of < np.uint64(stop):
+        for k in range(width):
+            held, other, more = planes[at + np.uint64(k)], by[of + np.uint64(k)], carry[k]
+            planes[at + np.uint64(k)] = held ^ other ^ more
+            able = held ^ flip
+            carry[k] = (able & other) | (more & (able ^ other))
+        at += width
+        of += width
+    while True:
+        some = _NONE
+        for k in range(width):
+            some |= carry[k]
+        if not some:
+            return np.int64((at - row) // width)
+        for k in range(width):
+            held, more = planes[at + np.uint64(k)], carry[k]
+            planes[at + np.uint64(k)] = held ^ more
+            carry[k] = (held ^ flip) & more
+        at += width
 
 
 @njit(cache=True, nogil=True)
-def _find_low(counts, at, low, offset, is_low):  # type: ignore[no-untyped-def]
-    """Tell of each of a word's 64 pixels whether it is above the lower threshold."""
+def _find_many(planes, row, used, fewest, many, carry):  # type: ignore[no-untyped-def]
+    """Find the pixels of a row that have so many events, one bit each; return how many planes have bits.
+
+    From the lowest bit on: with those so far, a sum is as large as ``fewest`` if the next bit of both is the same and it was
+    so before, or if its own is the greater one.
+    """
+    words = np.uint64(len(many))
+    for k in range(words):
+        many[k], carry[k] = _ALL, _NONE
+    full = 0
+    for plane in range(used):
+        some = _NONE
+        off_at = row + np.uint64(2 * plane) * words
+        on_at = off_at + words
+        passed = np.uint64(((fewest >> plane) & 1) - 1)  # all bits where the next one of ``fewest`` is 0
+        for k in range(words):
+            off, on, more = planes[off_at + np.uint64(k)], planes[on_at + np.uint64(k)], carry[k]
+            half = off ^ on
+            bit = half ^ more
+            some |= off | on
+            carry[k] = (off & on) | (more & half)
+            many[k] = (bit & passed) | (many[k] & (bit | passed))
+        if some:
+            full = plane + 1
+    passed, beyond = np.uint64(((fewest >> used) & 1) - 1), fewest >> (used + 1)
+    for k in range(words):  # one more plane, of carries alone
+        many[k] = _NONE if beyond else (carry[k] & passed) | (many[k] & (carry[k] | passed))
+    return full
+
+
+@njit(cache=True, nogil=True)
+def _unpack(planes, used, counts):  # type: ignore[no-untyped-def]
+    """Write the OFF and ON events of a word's 64 pixels; ``planes``: its words."""
+    for polarity in range(2):
+        for k in range(_WORD):
+            counts[polarity, k] = 0
+        for plane in range(used):
+            bits = planes[plane, polarity]
+            for k in range(_WORD):
+                counts[polarity, k] |= np.int64((bits >> np.uint64(k)) & np.uint64(1)) << plane
+
+
+@njit(cache=True, nogil=True)
+def _find_low(counts, low, offset, is_low):  # type: ignore[no-untyped-def]
+    """Return which of a word's 64 pixels are above the lower threshold, one bit each."""
     for k in range(_WORD):
-        off, on = np.int32(counts[at + np.uint64(k)]), np.int32(counts[at + np.uint64(_WORD + k)])
+        off, on = counts[0, k], counts[1, k]
         n, difference = off + on, abs(on - off)
-        is_low[k] = (n > 0) & (n >= low * (offset + difference))
+        is_low[k] = np.uint64((n > 0) & (n >= low * (offset + difference))) << np.uint64(k)
+    found = _NONE
+    for k in range(_WORD):
+        found |= is_low[k]
+    return found

@@ -60,3 +60,12 @@ def list_cells(box, width, height, across, down):  # type: ignore[no-untyped-def
                 member[end[cell]] = k
                 end[cell] += 1
     return first, member
+
+
+@njit(cache=True, nogil=True)
+def cells_with_members(first):  # type: ignore[no-untyped-def]
+    """Return of each cell whether its list has members, uint8: one look for the many events that are near nothing."""
+    some = np.empty(max(0, len(first) - 1), np.uint8)
+    for cell in range(len(some)):
+        some[cell] = first[cell] != first[cell + 1]
+    return some

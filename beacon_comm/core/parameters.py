@@ -16,8 +16,6 @@ from beacon_comm.core.errors import ParameterError
 Value = bool | int | float | str | tuple[float, ...]
 T = TypeVar('T')
 
-MOST_WINDOW_HOPS = (1 << 15) - 1  # a detection window of more hops would not be counted in 16 bits
-
 
 @dataclass(frozen=True, slots=True)
 class Declaration:
@@ -306,12 +304,6 @@ class Parameters(Declared):
             raise ParameterError(f'high_level = {self.high_level:g}: must be above |low_level| = {-self.low_level:g}')
         if self.levels == 'adaptive' and not self.high_share > self.low_share:
             raise ParameterError(f'high_share = {self.high_share:g}: must be above low_share = {self.low_share:g}')
-        long_s = self.long_window_bits * self.slowest_bit_s
-        if long_s > MOST_WINDOW_HOPS * self.hop_s:
-            raise ParameterError(
-                f'long_window_bits = {self.long_window_bits:g} of the slowest of bit_rates, {long_s:g} s, are more than'
-                f' {MOST_WINDOW_HOPS} times hop_s = {self.hop_s:g}'
-            )
         if self.min_area_px > self.max_area_px:
             raise ParameterError(f'min_area_px = {self.min_area_px}: above max_area_px = {self.max_area_px}')
         if self.judged_right > self.judged_last:

@@ -12,6 +12,7 @@ The routed events are sorted by track, stably, into one array:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -21,12 +22,13 @@ from numpy.typing import NDArray
 
 from beacon_comm.core.events import EventBatch
 from beacon_comm.core.hop_events import CODE_BITS, ROUTED, HopCounts, HopEvents, PixelGrid
-from beacon_comm.core.index_image import hop_length_ns, most_of_a_hop
-from beacon_comm.core.nearest import CELL_SHIFT, cell_lists, cells_along
+from beacon_comm.core.index_image import hop_length_ns
+from beacon_comm.core.nearest import CELL_SHIFT, cell_lists, cells_along, cells_with_members
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.tracks import Track, positions_at
 
-_FIRST_ROOM = 4096
+_FIRST_ROOM, _MORE_ROOM = 4096, 1.25
+_HANDED_OVER = 0.75  # a room that is filled by this share is handed over as it is, else what is in it
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +50,7 @@ class Router:
     """Routes the events of a hop interval, and gathers them for the detection windows.
 
     Args:
-        parameters: ``routing_extent_factor``, ``routing_margin_px``, ``hop_s``, and those of the windows' lengths.
+        parameters: ``routing_extent_factor``, ``routing_margin_px``, ``hop_s``.
         sensor_size: width and height (px).
 
     Attributes:
@@ -61,7 +63,7 @@ class Router:
         self._factor, self._margin = parameters.routing_extent_factor, parameters.routing_margin_px
         self._code, self._offset_ns = np.empty(_FIRST_ROOM, np.uint32), np.empty(_FIRST_ROOM, np.uint32)
         self._index, self._owner = np.empty(_FIRST_ROOM, np.int32), np.empty(_FIRST_ROOM, np.int32)
-        self._counts = HopCounts(self._grid, most_of_a_hop(parameters))
+        self._counts = HopCounts(self._grid)
         self._gathered = 0
         self.outside_events = 0
         self.aim((), 0)
@@ -149,10 +151,15 @@ class Router:
     def close(self) -> HopEvents:
         """Return the events gathered in the hop interval, and begin the next one."""
         n, self._gathered = self._gathered, 0
-        return HopEvents(self._code[:n].copy(), self._offset_ns[:n].copy(), *self._counts.take(), self._t_hop_ns)
+        code, offset_ns = self._code[:n], self._offset_ns[:n]
+        if n < _HANDED_OVER * len(self._code):
+            code, offset_ns = code.copy(), offset_ns.copy()
+        else:
+            self._code, self._offset_ns = np.empty_like(self._code), np.empty_like(self._offset_ns)
+        return HopEvents(code, offset_ns, *self._counts.take(), self._t_hop_ns)
 
     def _make_room(self, n: int) -> None:
-        room = 2 * (self._gathered + n)
+        room = math.ceil(_MORE_ROOM * (self._gathered + n))
         code, offset_ns, kept = self._code, self._offset_ns, self._gathered
         self._code, self._offset_ns = np.empty(room, np.uint32), np.empty(room, np.uint32)
         self._index, self._owner = np.empty(room, np.int32), np.empty(room, np.int32)
@@ -184,11 +191,11 @@ def _find_owners(  # type: ignore[no-untyped-def]
 
     First those that lie in a cell with a circle, then of these the nearest circle that holds each; the first of equals.
     """
+    has_circle = cells_with_members(first)
     near = np.uint64(0)  # unsigned, so that no place is taken to count from the end
     for i in range(len(x)):
-        cell = cell_of(x[i], y[i], cells_across)
         index[near] = i
-        near += np.uint64(first[cell] != first[cell + np.uint64(1)])
+        near += np.uint64(has_circle[cell_of(x[i], y[i], cells_across)])
     routed = np.uint64(0)
     for j in range(near):
         e = np.uint64(index[j])
