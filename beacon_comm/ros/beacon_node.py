@@ -233,21 +233,23 @@ class BeaconNode(Node):
     @guarded
     def _on_publish(self) -> None:
         frame_id = self._live.frame_id
-        for text in self._texts.take_changed():
-            self._text.publish(conversions.text_message(frame_id, text))
+        if self._text.get_subscription_count():  # what grows meanwhile is published once somebody comes
+            for text in self._texts.take_changed():
+                self._text.publish(conversions.text_message(frame_id, text))
         lost, self._lost = self._lost, []
         for beacon in lost:
             self._texts.forget(beacon.track_id)
-        if self._live.sensor_size is None:
+        wants_beacons, wants_bearings = self._beacons.get_subscription_count(), self._bearings.get_subscription_count()
+        if self._live.sensor_size is None or not (wants_beacons or wants_bearings):
             return
         at = self._live.now(self._now_ns())
         beacons = self._live.beacons()
-        if self._beacons.get_subscription_count():
+        if wants_beacons:
             everything = (*beacons, *lost)
             self._beacons.publish(
                 conversions.beacons_message(at, frame_id, everything, self._live.slots_full)
             )
-        if self._bearings.get_subscription_count():
+        if wants_bearings:
             self._bearings.publish(conversions.bearings_message(at, frame_id, beacons))
 
     # --- the event topic ---

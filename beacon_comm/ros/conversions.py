@@ -6,6 +6,7 @@ Times come in as :class:`~beacon_comm.ros.stamped.Instant`: the same instant on 
 from __future__ import annotations
 
 import math
+from array import array
 from collections.abc import Sequence
 
 from builtin_interfaces.msg import Time
@@ -73,8 +74,8 @@ def text_message(frame_id: str, text: BeaconText) -> Text:
         sensor_time_ns=text.at.sensor_ns,
         track_id=text.track_id,
         first_index=text.first_index,
-        codes=list(text.codes),
-        statuses=list(text.statuses),
+        codes=array('B', text.codes),
+        statuses=array('B', text.statuses),
         text=printable(text.codes),
     )
 

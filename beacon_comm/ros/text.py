@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from beacon_comm.ros.stamped import Instant, StampedCharacter
 
 _ESCAPES = {ord('\n'): '\\n', ord('\r'): '\\r', ord('\t'): '\\t', ord('\\'): '\\\\'}
+_PRINTABLE = [_ESCAPES.get(code, chr(code) if 0x20 <= code < 0x7F else f'\\x{code:02x}') for code in range(256)]
 
 
 def printable(codes: bytes) -> str:
     r"""Return codes as printable ASCII: ``\n``, ``\r``, ``\t``, ``\\``, and ``\xNN`` for what cannot be printed."""
-    return ''.join(
-        _ESCAPES[code] if code in _ESCAPES else chr(code) if 0x20 <= code < 0x7F else f'\\x{code:02x}'
-        for code in codes
-    )
+    return ''.join([_PRINTABLE[code] for code in codes])
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,23 +34,33 @@ class BeaconText:
     statuses: bytes
 
 
+@dataclass(slots=True)
+class _Growing:
+    """What one beacon has said so far: the last codes and statuses, and how many there were in all."""
+
+    at: Instant
+    codes: bytearray = field(default_factory=bytearray)
+    statuses: bytearray = field(default_factory=bytearray)
+    count: int = 0
+
+
 class Texts:
     """Keeps the last ``kept`` characters of every beacon."""
 
     def __init__(self, kept: int) -> None:
         self._kept = kept
-        self._characters: dict[int, deque[StampedCharacter]] = {}
-        self._counts: dict[int, int] = {}
+        self._growing: dict[int, _Growing] = {}
         self._changed: dict[int, None] = {}
 
     def add(self, stamped: StampedCharacter) -> None:
         """Append a character to its beacon's text."""
-        track_id = stamped.track_id
-        if track_id not in self._characters:
-            self._characters[track_id] = deque(maxlen=self._kept)
-        self._characters[track_id].append(stamped)
-        self._counts[track_id] = self._counts.get(track_id, 0) + 1
-        self._changed[track_id] = None
+        text = self._growing.setdefault(stamped.track_id, _Growing(stamped.at))
+        text.at = stamped.at
+        text.codes.append(stamped.character.code)
+        text.statuses.append(stamped.character.status)
+        del text.codes[: -self._kept], text.statuses[: -self._kept]
+        text.count += 1
+        self._changed[stamped.track_id] = None
 
     def take_changed(self) -> list[BeaconText]:
         """Return the texts that have grown since the last call."""
@@ -63,16 +70,9 @@ class Texts:
 
     def forget(self, track_id: int) -> None:
         """Drop the text of a beacon that is lost."""
-        self._characters.pop(track_id, None)
-        self._counts.pop(track_id, None)
+        self._growing.pop(track_id, None)
         self._changed.pop(track_id, None)
 
     def _text(self, track_id: int) -> BeaconText:
-        characters = [stamped.character for stamped in self._characters[track_id]]
-        return BeaconText(
-            track_id,
-            self._characters[track_id][-1].at,
-            self._counts[track_id] - len(characters),
-            bytes(character.code for character in characters),
-            bytes(character.status for character in characters),
-        )
+        text = self._growing[track_id]
+        return BeaconText(track_id, text.at, text.count - len(text.codes), bytes(text.codes), bytes(text.statuses))
