@@ -6,6 +6,7 @@ calibration is refused.
 
 from __future__ import annotations
 
+import gc
 import signal
 import sys
 from collections.abc import Sequence
@@ -74,6 +75,8 @@ def _run(args: Sequence[str] | None, stop: StopSignal) -> int:
         node = BeaconNode()
         executor = SingleThreadedExecutor()
         executor.add_node(node)
+        gc.collect()
+        gc.freeze()  # what stays for good, the compiler's above all, need not be gone through again: a tenth of a second
         stop.started()
         while rclpy.ok() and not stop.requested:
             executor.spin_once()  # the node's timers bound the wait
