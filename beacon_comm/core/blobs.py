@@ -41,11 +41,11 @@ from beacon_comm.core.components import (
 )  # fmt: skip
 from beacon_comm.core.hop_events import CODE_BITS, HopEvents, PixelGrid
 from beacon_comm.core.index_image import IndexImages, Window, hop_length_ns, pixel_counts
-from beacon_comm.core.nearest import CELL_SHIFT, cell_lists, cells_along, cells_with_members
+from beacon_comm.core.nearest import CELL_SHIFT, cells_with_members, list_cells
 from beacon_comm.core.parameters import Parameters
 
-_FRESH_EVENTS = 4  # fewer new events say nothing about the position …
-_FRESH_SHARE = 0.1  # … nor does less than this share of its mean: a held LED in front of a moving background
+FRESH_EVENTS = 4  # fewer new events say nothing about the position …
+FRESH_SHARE = 0.1  # … nor does less than this share of its mean: a held LED in front of a moving background
 SPREAD_EVENTS = 30  # fewer events say nothing about the extent
 AS_ACTIVE = 0.5  # share of the events a pixel that makes another pixel "about as active"
 
@@ -119,39 +119,28 @@ class BlobFinder:
         if images.empty:
             return []
         self._sets = [f.find(window) for f, window in zip(self._finders, images.windows, strict=False)]
+        if not any(map(len, self._sets)):
+            return []
         standing = self._choose(images.windows)
         window = np.repeat(np.arange(len(standing)), [len(numbers) for numbers in standing])
         if len(window) == 0:
             return []
         sums = np.concatenate([s.sums[c] for s, c in zip(self._sets, standing, strict=True)])
         index = np.concatenate([s.index[c] for s, c in zip(self._sets, standing, strict=True)])
-        length = np.array([w.hops for w in images.windows])[window]
-        return self._blobs(window, sums, index, length, images.newest, t_hop_ns)
+        length = np.array([w.hops for w in images.windows])
+        return self._observe(window, sums, index, length, images.newest, t_hop_ns)
 
     def _choose(self, windows: list[Window]) -> list[NDArray[np.int64]]:
         """Return for each window which components stand as blobs, and let them own their pixels."""
         p = self._parameters
-        stands = [
-            (s.sums[:, SEEDS] > 0) & (s.sums[:, AREA] >= p.min_area_px) & (s.sums[:, AREA] <= p.max_area_px)
-            for s in self._sets
-        ]
-        short = self._sets[0]
-        if len(self._sets) > 1:
-            long = self._sets[1]
-            stands[1] &= _long_stands(
-                long.run, long.first, stands[1], short.label, stands[0], windows[0].planes, windows[0].used, self._grid.shift
-            )
-        chosen = [np.flatnonzero(which) for which in stands]
-        number = np.where(short.sums[:, AREA] > p.max_area_px, -1, 0)
-        number[chosen[0]] = np.arange(1, 1 + len(chosen[0]))
-        _own(short.run, short.first, number, self.owner)
-        if len(self._sets) > 1:
-            number = np.zeros(len(stands[1]), np.int64)
-            number[chosen[1]] = np.arange(1 + len(chosen[0]), 1 + len(chosen[0]) + len(chosen[1]))
-            _own(long.run, long.first, number, self.owner)
-        return chosen
+        short, long = self._sets[0], self._sets[-1]
+        chosen = _choose(
+            (short.run, short.first, short.sums), (long.run, long.first, long.sums), len(self._sets) > 1,
+            p.min_area_px, p.max_area_px, short.label, windows[0].planes, windows[0].used, self._grid.shift, self.owner,
+        )  # fmt: skip
+        return list(chosen[: len(self._sets)])
 
-    def _blobs(
+    def _observe(
         self,
         window: NDArray[np.int64],
         sums: NDArray[np.int64],
@@ -160,62 +149,91 @@ class BlobFinder:
         newest: HopEvents,
         t_hop_ns: int,
     ) -> list[Blob]:
-        """Observe the components that stand; see the module's head."""
-        x, y, extent = _centre_and_extent(*(sums[:, k] for k in (COUNT, COUNT_X, COUNT_Y, COUNT_RR)))
-        n, sum_x, sum_y, sum_rr, sum_t = self._sum_newest(x, y, extent, sums, newest).T
-        new_x, new_y, spread = _centre_and_extent(np.maximum(n, 1), sum_x, sum_y, sum_rr)
-        fresh = n >= np.maximum(_FRESH_EVENTS, _FRESH_SHARE * sums[:, COUNT] / length)
-        new_t = t_hop_ns - self._hop_ns + sum_t // np.maximum(n, 1)
-        t_ns = np.where(fresh, new_t, t_hop_ns - length * self._hop_ns // 2)
-        x, y = np.where(fresh, new_x, x), np.where(fresh, new_y, y)
-        extent = np.where(fresh & (n >= SPREAD_EVENTS), np.minimum(extent, spread), extent)
-        columns = (x, y, t_ns, extent, index, sums[:, COUNT], sums[:, AREA], n, fresh, window)
-        return [Blob(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
+        """Observe the components that stand; see the module's head.
 
-    def _sum_newest(
-        self,
-        x: NDArray[np.float64],
-        y: NDArray[np.float64],
-        extent: NDArray[np.float64],
-        sums: NDArray[np.int64],
-        newest: HopEvents,
-    ) -> NDArray[np.int64]:
-        """Return n, Σx, Σy, Σ(x² + y²), Σ(t - hop's begin) of each blob's newest events, ``(m, 5)`` int64."""
+        Args:
+            window, sums, index: of each, as in :class:`Blob` and :class:`ComponentSet`.
+            length: of each window, in hops.
+            newest: the newest hop's events.
+            t_hop_ns: its end (ns).
+        """
         p = self._parameters
-        width, height = self._grid.width, self._grid.height
-        radius = extent * p.routing_extent_factor + p.routing_margin_px
-        box = np.stack(
-            (
-                np.minimum(sums[:, LEFT], x - radius),
-                np.maximum(sums[:, RIGHT], x + radius),
-                np.minimum(sums[:, TOP], y - radius),
-                np.maximum(sums[:, BOTTOM], y + radius),
-            ),
-            axis=1,
-        )
-        first, member = cell_lists(box, width, height)
-        circle = np.stack((x, y, radius**2), axis=1)
-        summed: NDArray[np.int64] = _sum_newest(
-            newest.code, newest.offset_ns, self._grid.shift, cells_along(width), first, member, circle, self.owner
-        )
-        return summed
-
-
-def _centre_and_extent(
-    n: NDArray[np.int64], sum_x: NDArray[np.int64], sum_y: NDArray[np.int64], sum_rr: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return centres and extents (px) of n events by their Σx, Σy, Σ(x² + y²), all ``(m,)``."""
-    x, y = sum_x / n, sum_y / n
-    # Coordinates below 2¹⁶: the difference of squares is good to 10⁻⁵ px².
-    return x, y, np.sqrt(2.0 * np.maximum(sum_rr / n - x * x - y * y, 0.0))
+        seen = _observe(
+            window, sums, length, newest.code, newest.offset_ns, (self._grid.width, self._grid.height, self._grid.shift),
+            p.routing_extent_factor, p.routing_margin_px, self._hop_ns, self.owner,
+        )  # fmt: skip
+        return [
+            Blob(x, y, t_hop_ns - int(ago_ns), extent, i, count, area, int(n), fresh > 0.0, w)
+            for (x, y, ago_ns, extent, n, fresh), i, count, area, w in zip(
+                seen.tolist(), index.tolist(), sums[:, COUNT].tolist(), sums[:, AREA].tolist(), window.tolist(), strict=True
+            )
+        ]
 
 
 @njit(cache=True, nogil=True)
-def _own(run, first, number, owner):  # type: ignore[no-untyped-def]
-    """Give every pixel of a component the component's number, unless that is 0."""
-    for c in range(len(number)):
-        if number[c] != 0:
-            paint(run[first[c] : first[c + 1]], owner, number[c])
+def _choose(  # type: ignore[no-untyped-def]
+    short, long, has_long, min_area, max_area, short_label, planes, used, shift, owner
+):
+    """Compile :meth:`BlobFinder._choose`; ``short``, ``long``: runs, their begins, and sums; ``planes``, ``used``: the short
+    window's."""
+    run, first, sums = short
+    stands, long_stands = _fit(sums, min_area, max_area), np.zeros(0, np.bool_)
+    if has_long:
+        fits = _fit(long[2], min_area, max_area)
+        long_stands = fits & _long_stands(long[0], long[1], fits, short_label, stands, planes, used, shift)
+    blobs = 0
+    for c in range(len(sums)):
+        if stands[c]:
+            blobs += 1
+            paint(run[first[c] : first[c + 1]], owner, blobs)
+        elif sums[c, AREA] > max_area:
+            paint(run[first[c] : first[c + 1]], owner, -1)
+    for c in range(len(long_stands)):
+        if long_stands[c]:
+            blobs += 1
+            paint(long[0][long[1][c] : long[1][c + 1]], owner, blobs)
+    return np.flatnonzero(stands), np.flatnonzero(long_stands)
+
+
+@njit(cache=True, nogil=True)
+def _fit(sums, min_area, max_area):  # type: ignore[no-untyped-def]
+    """Return which components have a seed and a size that blobs may have."""
+    return (sums[:, SEEDS] > 0) & (sums[:, AREA] >= min_area) & (sums[:, AREA] <= max_area)
+
+
+@njit(cache=True, nogil=True)
+def _centre_and_extent(n, sum_x, sum_y, sum_rr):  # type: ignore[no-untyped-def]
+    """Return centre and extent (px) of n events by their Σx, Σy, Σ(x² + y²)."""
+    x, y = sum_x / n, sum_y / n
+    # Coordinates below 2¹⁶: the difference of squares is good to 10⁻⁵ px².
+    return x, y, np.sqrt(2.0 * max(sum_rr / n - x * x - y * y, 0.0))
+
+
+@njit(cache=True, nogil=True)
+def _observe(window, sums, length, code, offset_ns, grid, factor, margin, hop_ns, owner):  # type: ignore[no-untyped-def]
+    """Return centre (px), time before the hop's end (ns), extent (px), newest events, whether these are fresh: ``(m, 6)``."""
+    seen, circle, box = np.empty((len(sums), 6)), np.empty((len(sums), 3)), np.empty((len(sums), 4))
+    for b in range(len(sums)):
+        x, y, extent = _centre_and_extent(sums[b, COUNT], sums[b, COUNT_X], sums[b, COUNT_Y], sums[b, COUNT_RR])
+        radius = extent * factor + margin
+        circle[b, 0], circle[b, 1], circle[b, 2] = x, y, radius**2
+        box[b, 0], box[b, 1] = min(sums[b, LEFT], x - radius), max(sums[b, RIGHT], x + radius)
+        box[b, 2], box[b, 3] = min(sums[b, TOP], y - radius), max(sums[b, BOTTOM], y + radius)
+        seen[b, 0], seen[b, 1], seen[b, 3] = x, y, extent
+    width, height, shift = grid
+    across, down = ((width - 1) >> CELL_SHIFT) + 1, ((height - 1) >> CELL_SHIFT) + 1
+    first, member = list_cells(box, width, height, across, down)
+    newest = _sum_newest(code, offset_ns, shift, across, first, member, circle, owner)
+    for b in range(len(sums)):
+        n, hops = newest[b, 0], length[window[b]]
+        fresh = n >= max(FRESH_EVENTS, FRESH_SHARE * sums[b, COUNT] / hops)
+        seen[b, 2], seen[b, 4], seen[b, 5] = hops * hop_ns // 2, n, fresh
+        if fresh:
+            x, y, spread = _centre_and_extent(n, newest[b, 1], newest[b, 2], newest[b, 3])
+            seen[b, 0], seen[b, 1], seen[b, 2] = x, y, hop_ns - newest[b, 4] // n
+            if n >= SPREAD_EVENTS:
+                seen[b, 3] = min(seen[b, 3], spread)
+    return seen
 
 
 @njit(cache=True, nogil=True)
@@ -256,7 +274,7 @@ def _long_stands(run, first, fits, short_label, short_fits, planes, used, shift)
 
 @njit(cache=True, nogil=True)
 def _sum_newest(code, offset_ns, shift, cells_across, first, member, circle, owner):  # type: ignore[no-untyped-def]
-    """Sum up the newest events of each blob; see :meth:`BlobFinder._sum_newest`."""
+    """Return n, Σx, Σy, Σ(x² + y²), Σ(t - hop's begin) of each blob's newest events, ``(m, 5)`` int64."""
     sums = np.zeros((len(circle), 5), np.int64)
     has_circle = cells_with_members(first)
     index = np.empty(len(code), np.int32)

@@ -19,10 +19,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from beacon_comm.core.signature import Signature
-from beacon_comm.core.tracks import Track, positions_at
+from beacon_comm.core.tracks import Track
 
 Events = tuple[NDArray[np.int64], NDArray[np.int8]]
 Backlog = Callable[[int], Events]
@@ -93,22 +94,28 @@ class Meetings:
         return found
 
 
-def _differences(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    return vectors[:, None, :] - vectors[None, :, :]
-
-
 def _near_pairs(tracks: list[Track], t_hop_ns: int, hop_s: float) -> list[tuple[int, int]]:
     """Return the labels of those that are near one another, or were within the hop."""
     if len(tracks) < 2:
         return []
-    moving = np.array([(track.vx_px_per_s, track.vy_px_per_s, track.extent_px) for track in tracks])
-    apart = _differences(positions_at(tracks, t_hop_ns))
-    moved = _differences(moving[:, :2]) * hop_s  # within the hop
-    share = np.clip((apart * moved).sum(axis=2) / np.maximum((moved * moved).sum(axis=2), 1e-9), 0.0, 1.0)
-    distance = np.linalg.norm(apart - share[:, :, None] * moved, axis=2)  # when they were nearest
-    reach = moving[:, 2]
-    pairs = np.argwhere(np.triu(distance <= reach[:, None] + reach[None, :] + NEAR_PX, 1))
+    state = np.array([(*t.position_at(t_hop_ns), t.vx_px_per_s, t.vy_px_per_s, t.extent_px) for t in tracks])
+    pairs = zip(*(one.tolist() for one in _pairs(state, hop_s)), strict=True)
     return [(tracks[i].track_id, tracks[j].track_id) for i, j in pairs]
+
+
+@njit(cache=True, nogil=True)
+def _pairs(state, hop_s):  # type: ignore[no-untyped-def]
+    """Return those that are near one another, ``(n,)`` int64 twice; ``state``: x, y at the hop, velocity, extent."""
+    first, second = [], []
+    for i in range(len(state)):
+        for j in range(i + 1, len(state)):
+            x, y = state[i, 0] - state[j, 0], state[i, 1] - state[j, 1]
+            dx, dy = (state[i, 2] - state[j, 2]) * hop_s, (state[i, 3] - state[j, 3]) * hop_s  # within the hop
+            share = min(max((x * dx + y * dy) / max(dx * dx + dy * dy, 1e-9), 0.0), 1.0)  # of it ago they were nearest
+            if np.hypot(x - share * dx, y - share * dy) <= state[i, 4] + state[j, 4] + NEAR_PX:
+                first.append(i)
+                second.append(j)
+    return np.array(first, np.int64), np.array(second, np.int64)
 
 
 def _decide(

@@ -23,6 +23,7 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from beacon_comm.core import motion
@@ -227,7 +228,7 @@ class MotionTracker(Tracker):
     def __init__(self, parameters: Parameters, sensor_size: tuple[int, int]) -> None:
         super().__init__(parameters, sensor_size)
         hops = window_hops(parameters)
-        self._forget = np.repeat([1.0 - 1.0 / hops[0], 1.0 - 1.0 / hops[-1]], 2)
+        self._forget = np.array([1.0 - 1.0 / hops[0], 1.0 - 1.0 / hops[-1]])
         self._reacquire_ns = round(parameters.reacquire_s * NS_PER_S)
         self._merge_unread_ns = round(min(_MERGE_UNREAD_S, parameters.merge_after_s) * NS_PER_S)
         self._remembered: dict[int, MotionTrack] = {}
@@ -241,16 +242,15 @@ class MotionTracker(Tracker):
         tracks: list[MotionTrack] = list(self._tracks.values())  # type: ignore[arg-type]
         blob_of, track_of = self._matched(tracks, blobs, t_hop_ns)
         rows = np.array([track.row for track in tracks]) if tracks else np.empty((0, motion.WIDTH))
-        own, index, spread = self._evidence(rows)
+        evidence = _evidence(rows, self._forget, self._parameters.index_offset).tolist()
         hop_s = self._parameters.hop_s
-        seen = (
-            (own >= np.maximum(_FEWEST_EVENTS, _SEEN_SHARE * rows[:, USUAL] * hop_s)) & (index >= self._least_index)
-        ).tolist()
         for i, track in enumerate(tracks):
             track.row[SHORT_ON : LONG_OFF + 1] = rows[i, SHORT_ON : LONG_OFF + 1]
-            if blob_of[i] >= 0 or seen[i]:
+            own, index, spread = evidence[i]
+            seen = own >= max(_FEWEST_EVENTS, _SEEN_SHARE * float(rows[i, USUAL]) * hop_s) and index >= self._least_index
+            if blob_of[i] >= 0 or seen:
                 blob = blobs[blob_of[i]] if blob_of[i] >= 0 else None
-                self._see(track, blob, t_hop_ns, float(own[i]), float(index[i]), float(spread[i]), seen[i])
+                self._see(track, blob, t_hop_ns, own, index, spread, seen)
             else:
                 if not track.quiet:
                     track.fall_quiet()
@@ -323,21 +323,6 @@ class MotionTracker(Tracker):
                 best, least = track, distance / (1.0 + deviation)
         return best if best is not None and t_hop_ns - best.last_seen_ns < self._reacquire_ns else None
 
-    def _evidence(self, rows: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return each track's events of the hop, its index and the spread of the events as an extent (px)."""
-        own = rows[:, HOP_ON] + rows[:, HOP_OFF]
-        rows[:, SHORT_ON : LONG_OFF + 1] *= self._forget
-        for on, off in ((SHORT_ON, SHORT_OFF), (LONG_ON, LONG_OFF)):
-            rows[:, on] += rows[:, HOP_ON]
-            rows[:, off] += rows[:, HOP_OFF]
-        area = np.pi * np.maximum(rows[:, EXTENT], 1.0) ** 2
-        index = np.zeros(len(rows))
-        for on, off in ((SHORT_ON, SHORT_OFF), (LONG_ON, LONG_OFF)):
-            n, difference = rows[:, on] + rows[:, off], np.abs(rows[:, on] - rows[:, off])
-            index = np.maximum(index, n / (self._parameters.index_offset * area + difference))
-        n = np.maximum(own, 1.0)
-        return own, index, np.sqrt(2.0 * rows[:, HOP_RR] / n)
-
     def _see(
         self, track: MotionTrack, blob: Blob | None, t_hop_ns: int, own: float, index: float, spread: float, seen: bool
     ) -> None:
@@ -394,19 +379,14 @@ class MotionTracker(Tracker):
 
         Of two that are read, or of two that are not, the younger is the double; else the one that is not.
         """
-        if len(tracks) < 2:
+        state = np.array([(*t.position_at(t_hop_ns), t.extent_px, t.quiet) for t in tracks]).reshape(-1, 4)
+        near, some = _near(state)
+        if not some.any():
             for track in tracks:
                 track.covered_since_ns = None
             return
-        centre = positions_at(tracks, t_hop_ns)
-        extent = np.array([track.extent_px for track in tracks])
-        quiet = np.array([track.quiet for track in tracks])
+        quiet = state[:, 3] > 0.0
         unread = np.array([track.known_bps is None for track in tracks])
-        distance = np.hypot(*(centre[:, None, :] - centre[None, :, :]).transpose(2, 0, 1))
-        near = distance < _SAME_EXTENTS * np.minimum(extent[:, None], extent[None, :])
-        near |= (distance < extent[None, :]) & quiet[:, None] & ~quiet[None, :]
-        np.fill_diagonal(near, False)
-        some = near.any(axis=1)
         for i, track in enumerate(tracks):
             if not some[i]:
                 track.covered_since_ns = None
@@ -484,3 +464,40 @@ class MotionTracker(Tracker):
         track.row[TRUST] = 1.0
         track.row[USUAL] = blob.fresh_count / self._parameters.hop_s
         return track
+
+
+@njit(cache=True, nogil=True)
+def _evidence(rows, forget, offset):  # type: ignore[no-untyped-def]
+    """Move the tracks' sums on by a hop; return each one's events of the hop, its index and the spread of the events as an
+    extent (px), ``(n, 3)``."""
+    found = np.empty((len(rows), 3))
+    for i in range(len(rows)):
+        row = rows[i]
+        own = row[HOP_ON] + row[HOP_OFF]
+        area = np.pi * max(row[EXTENT], 1.0) ** 2
+        index = 0.0
+        for k, on, off in ((0, SHORT_ON, SHORT_OFF), (1, LONG_ON, LONG_OFF)):
+            row[on] = row[on] * forget[k] + row[HOP_ON]
+            row[off] = row[off] * forget[k] + row[HOP_OFF]
+            index = max(index, (row[on] + row[off]) / (offset * area + abs(row[on] - row[off])))
+        found[i, 0], found[i, 1], found[i, 2] = own, index, np.sqrt(2.0 * row[HOP_RR] / max(own, 1.0))
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _near(state):  # type: ignore[no-untyped-def]
+    """Return of each track which others it may be one light with, ``(n, n)``, and whether there are any, ``(n,)``.
+
+    ``state``: x, y, extent, whether it is quiet.
+    """
+    n = len(state)
+    near, some = np.zeros((n, n), np.bool_), np.zeros(n, np.bool_)
+    for i in range(n):
+        for j in range(n):
+            if i != j:
+                distance = np.hypot(state[i, 0] - state[j, 0], state[i, 1] - state[j, 1])
+                same = distance < _SAME_EXTENTS * min(state[i, 2], state[j, 2])
+                within = distance < state[j, 2] and state[i, 3] > 0.0 and state[j, 3] == 0.0
+                near[i, j] = same or within
+                some[i] |= near[i, j]
+    return near, some

@@ -273,17 +273,23 @@ class Tracker:
         """Return the pairs of track and blob within the track's gate, and their squared distances (px²), ``(n,)`` each."""
         if not tracks or not blobs:
             return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
-        p = self._parameters
-        moving = np.array([(t.vx_px_per_s, t.vy_px_per_s, t.extent_px) for t in tracks])
-        unseen_s = np.array([t_hop_ns - track.matched_ns for track in tracks]) / NS_PER_S
-        gate = np.minimum(p.max_gate_px, p.association_gate_px + p.gate_growth_px_per_s * unseen_s)
-        # The centre of a large blob is uncertain by a share of its size.
-        gate = np.maximum(gate, moving[:, 2])
-        state = np.column_stack((centre, moving[:, :2], gate))
-        seen = np.array([(blob.x_px, blob.y_px, (t_hop_ns - blob.t_ns) / NS_PER_S) for blob in blobs])
+        state = np.array(
+            [
+                (x, y, track.vx_px_per_s, track.vy_px_per_s, self._gate_px(track, t_hop_ns))
+                for track, (x, y) in zip(tracks, centre.tolist(), strict=True)
+            ]
+        )
+        seen = np.array(
+            [(blob.x_px, blob.y_px, (t_hop_ns - blob.t_ns) / NS_PER_S, self._is_light(blob)) for blob in blobs], np.float64
+        )
         first, second, distance2 = _pairs(state, seen)
-        light = np.array([self._is_light(blob) for blob in blobs])[second]
-        return first[light], second[light], distance2[light]
+        return first, second, distance2
+
+    def _gate_px(self, track: Track, t_hop_ns: int) -> float:
+        p = self._parameters
+        gate_px = p.association_gate_px + p.gate_growth_px_per_s * (t_hop_ns - track.matched_ns) / NS_PER_S
+        # The centre of a large blob is uncertain by a share of its size.
+        return max(min(p.max_gate_px, gate_px), track.extent_px)
 
     def _keep_on_sensor(self, track: Track, t_hop_ns: int) -> None:
         """Let an unseen track wait at the border where it left: it cannot be seen beyond."""
@@ -379,14 +385,7 @@ def is_same_rate(one_bps: float, other_bps: float) -> bool:
 
 def positions_at(tracks: Sequence[Track], t_ns: int) -> NDArray[np.float64]:
     """Return the predicted centres (px) of tracks at ``t_ns`` (ns), ``(n, 2)`` float64."""
-    if not tracks:
-        return np.empty((0, 2))
-    state = np.array([(t.x_px, t.y_px, t.vx_px_per_s, t.vy_px_per_s, t_ns - t.t_ns) for t in tracks])
-    dt_s = state[:, 4] / NS_PER_S
-    faded = STEADY_S - FADE_S * np.expm1((STEADY_S - np.maximum(dt_s, STEADY_S)) / FADE_S)
-    s = np.where(dt_s <= STEADY_S, dt_s, faded)
-    positions: NDArray[np.float64] = state[:, :2] + state[:, 2:4] * s[:, None]
-    return positions
+    return np.array([track.position_at(t_ns) for track in tracks]).reshape(-1, 2)
 
 
 def _take(track: Track, blob: Blob, t_hop_ns: int) -> None:
@@ -448,9 +447,9 @@ def fading_s(dt_s: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _pairs(state, seen):  # type: ignore[no-untyped-def]
-    """List the pairs of track and blob within the track's gate, and their squared distances.
+    """List the pairs of track and light within the track's gate, and their squared distances.
 
-    ``state``: x, y at the hop, velocity, gate; ``seen``: x, y, age of the blob (s).
+    ``state``: x, y at the hop, velocity, gate; ``seen``: x, y, age of the blob (s), whether it may be a light.
     """
     first, second, distance2 = [], [], []
     for i in range(len(state)):
@@ -458,7 +457,7 @@ def _pairs(state, seen):  # type: ignore[no-untyped-def]
             dx = seen[j, 0] - (state[i, 0] - state[i, 2] * seen[j, 2])
             dy = seen[j, 1] - (state[i, 1] - state[i, 3] * seen[j, 2])
             d2 = dx * dx + dy * dy
-            if d2 <= state[i, 4] ** 2:
+            if seen[j, 3] and d2 <= state[i, 4] ** 2:
                 first.append(i)
                 second.append(j)
                 distance2.append(d2)

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from beacon_comm.core.blobs import AS_ACTIVE, Blob, BlobFinder
-from beacon_comm.core.components import AREA, SEEDS
+from beacon_comm.core.blobs import AS_ACTIVE, FRESH_EVENTS, FRESH_SHARE, SPREAD_EVENTS, Blob, BlobFinder
+from beacon_comm.core.components import AREA, COUNT, COUNT_RR, COUNT_X, COUNT_Y, SEEDS
 from beacon_comm.core.detection import Detector
 from beacon_comm.core.errors import ParameterError
 from beacon_comm.core.event_buffer import EventBuffer
@@ -230,8 +230,8 @@ class ReferenceBlobFinder(BlobFinder):
         window = np.repeat(np.arange(len(sets)), [len(chosen) for chosen in standing])
         sums = np.concatenate([s.sums[c] for s, c in zip(sets, standing, strict=True)])
         index = np.concatenate([s.index[c] for s, c in zip(sets, standing, strict=True)])
-        length = np.array([w.hops for w in images.windows])[window]
-        return self._blobs(window, sums, index, length, images.newest, t_hop_ns)  # type: ignore[arg-type]
+        length = np.array([w.hops for w in images.windows])
+        return self._observe(window, sums, index, length, images.newest, t_hop_ns)
 
     def _let_stand(
         self, sets: list[ReferenceComponents], stands: list[NDArray[np.bool_]], short_n: NDArray[np.int64]
@@ -248,9 +248,29 @@ class ReferenceBlobFinder(BlobFinder):
         covered = np.append(False, stands[1])[long.label]
         stands[0][short.label[covered & (short.label > 0)] - 1] = False
 
-    def _sum_newest(  # type: ignore[override]
-        self, x: NDArray, y: NDArray, extent: NDArray, sums: NDArray[np.int64], newest: ReferenceEvents
-    ) -> NDArray[np.int64]:
+    def _observe(  # type: ignore[override]
+        self,
+        window: NDArray[np.int64],
+        sums: NDArray[np.int64],
+        index: NDArray[np.float64],
+        length: NDArray[np.int64],
+        newest: ReferenceEvents,
+        t_hop_ns: int,
+    ) -> list[Blob]:
+        length = length[window]
+        x, y, extent = _centre_and_extent(*(sums[:, k] for k in (COUNT, COUNT_X, COUNT_Y, COUNT_RR)))
+        n, sum_x, sum_y, sum_rr, sum_t = self._sum_newest(x, y, extent, newest).T
+        new_x, new_y, spread = _centre_and_extent(np.maximum(n, 1), sum_x, sum_y, sum_rr)
+        fresh = n >= np.maximum(FRESH_EVENTS, FRESH_SHARE * sums[:, COUNT] / length)
+        new_t = t_hop_ns - self._hop_ns + sum_t // np.maximum(n, 1)
+        t_ns = np.where(fresh, new_t, t_hop_ns - length * self._hop_ns // 2)
+        x, y = np.where(fresh, new_x, x), np.where(fresh, new_y, y)
+        extent = np.where(fresh & (n >= SPREAD_EVENTS), np.minimum(extent, spread), extent)
+        columns = (x, y, t_ns, extent, index, sums[:, COUNT], sums[:, AREA], n, fresh, window)
+        return [Blob(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
+
+    def _sum_newest(self, x: NDArray, y: NDArray, extent: NDArray, newest: ReferenceEvents) -> NDArray[np.int64]:
+        """Return n, Σx, Σy, Σ(x² + y²), Σ(t - hop's begin) of each blob's newest events, ``(m, 5)``."""
         p = self._parameters
         owner = self.owner[newest.y, newest.x] - 1
         free = np.flatnonzero(owner == -1)
@@ -264,6 +284,12 @@ class ReferenceBlobFinder(BlobFinder):
         ex, ey, dt_ns = newest.x[of], newest.y[of], newest.t_ns[of] - self._t_start_ns
         weights = (np.ones_like(ex), ex, ey, ex * ex + ey * ey, dt_ns)
         return np.column_stack([np.bincount(owner[of], weight, len(x)).astype(np.int64) for weight in weights])
+
+
+def _centre_and_extent(n: NDArray, sum_x: NDArray, sum_y: NDArray, sum_rr: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Return centres and extents (px) of n events by their Σx, Σy, Σ(x² + y²), all ``(m,)``."""
+    x, y = sum_x / n, sum_y / n
+    return x, y, np.sqrt(2.0 * np.maximum(sum_rr / n - x * x - y * y, 0.0))
 
 
 class ReferenceDetector(Detector):
