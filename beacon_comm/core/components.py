@@ -106,34 +106,46 @@ def _close(low, side, width, wide, closed):  # type: ignore[no-untyped-def]
     before, after = side // 2, side - 1 - side // 2
     last = _ALL >> np.uint64(-width & 63)  # the pixels of a row's last word
     spread = np.empty(words, np.uint64)
-    filled = np.empty(height, np.bool_)
+    filled = _filled_rows(low, words)
+    near = np.zeros(height, np.bool_)
     for y in range(height):
-        _widen(low[y, :words], before, after, wide[y])
-        wide[y, -1] &= last
-        filled[y] = _has_any(wide[y])
+        if filled[y]:  # its pixels reach the rows y - before … y + after
+            _widen(low[y, :words], before, after, wide[y])
+            wide[y, -1] &= last
+            near[max(y - before, 0) : y + after + 1] = True
     for y in range(height):
-        # Set pixels of the rows y - after … y + before reach this one.
-        from_row, to_row = max(y - after, 0), min(y + before, height - 1)
-        near = False
-        for other in range(from_row, to_row + 1):
-            near |= filled[other]
-        if not near:
-            closed[y, :] = _NONE
-            continue
-        spread[:] = _NONE
-        for other in range(from_row, to_row + 1):
+        if near[y]:
+            spread[:] = _NONE
+            for other in range(max(y - after, 0), min(y + before, height - 1) + 1):
+                if filled[other]:
+                    for k in range(words):
+                        spread[k] |= wide[other, k]
+            _narrow(spread, before, after, last, closed[y])
+        else:
             for k in range(words):
-                spread[k] |= wide[other, k]
-        _narrow(spread, before, after, last, closed[y])
+                closed[y, k] = _NONE
     for y in range(height):
-        filled[y] = _has_any(closed[y])
-        wide[y, :] = closed[y]
+        for k in range(words):
+            wide[y, k] = closed[y, k]
+    filled = _filled_rows(closed, words)
     for y in range(height):
         # It stays where the rows y - before … y + after, as they were, are set.
         if filled[y]:
             for other in range(max(y - before, 0), min(y + after, height - 1) + 1):
                 for k in range(words):
                     closed[y, k] &= wide[other, k]
+
+
+@njit(cache=True, nogil=True)
+def _filled_rows(bits, words):  # type: ignore[no-untyped-def]
+    """Return which rows have a set pixel; an array slice a row would take longer than looking."""
+    filled = np.empty(len(bits), np.bool_)
+    for y in range(len(bits)):
+        some = _NONE
+        for k in range(words):
+            some |= bits[y, k]
+        filled[y] = some != _NONE
+    return filled
 
 
 @njit(cache=True, nogil=True)
@@ -193,11 +205,12 @@ def _find_runs(bits, width, shift):  # type: ignore[no-untyped-def]
     """List the runs of all rows, ``(r, 2)`` int32 as in ComponentSet, and where each row's begin, ``(height + 1,)``."""
     height, words = len(bits), ((width - 1) >> WORD_SHIFT) + 1
     row_first = np.zeros(height + 1, np.int64)
+    filled = _filled_rows(bits, words)
     run = np.empty((1024, 2), np.int32)
     n = 0
     for y in range(height):
         row_first[y + 1] = n
-        if not _has_any(bits[y]):
+        if not filled[y]:
             continue
         start = -1  # of a run that reaches the end of the word before
         for k in range(words):

@@ -9,6 +9,7 @@ them on end are a *word*, as in the images of one bit a pixel.
 
 Counts are kept as *bit planes*: bit k of the counts of 64 pixels is one word.  As most pixels have few events, most planes
 are empty, and what is left is small enough for the processor's caches; counts are added 64 at a time by their carries.
+An image of them has the first four planes of all rows, then the next four: what is used lies together.
 
 Events are counted as they arrive, so that the windows have planes to look at, not events.  A hop counts 255 events of a pixel
 and polarity at most: one with more of both than that in a hop has the index of a balanced one.
@@ -27,6 +28,9 @@ MAX_HEIGHT = 1 << 16
 WORD_SHIFT = 6  # 64 pixels a word
 HOP_PLANES = 8  # of a hop's counts
 BRANCHLESS = 2  # of them
+GROUP_SHIFT = 2  # four planes of a row lie side by side
+_IN_GROUP = (1 << GROUP_SHIFT) - 1
+_BLOCK = 1024  # events whose places are found together
 
 ON, ROUTED = 1, 2
 CODE_BITS = 2
@@ -108,6 +112,12 @@ def no_events() -> HopEvents:
     return HopEvents(none, none, np.empty(0, np.int64), np.zeros(1, np.int64), np.empty(0, np.uint64), 0)
 
 
+def empty_planes(grid: PixelGrid, planes: int) -> NDArray[np.uint64]:
+    """Return an image of so many planes, or a few more, ``(groups, height, 4, 2, words)`` uint64; see the module's head."""
+    groups = -(-planes // (1 << GROUP_SHIFT))
+    return np.zeros((groups, grid.height, 1 << GROUP_SHIFT, 2, grid.words), np.uint64)
+
+
 class HopCounts:
     """Counts the events of a hop as they arrive.
 
@@ -116,86 +126,111 @@ class HopCounts:
     """
 
     def __init__(self, grid: PixelGrid) -> None:
-        self._shift, self._words = grid.shift, grid.words
-        self._planes = np.zeros((grid.height, HOP_PLANES, 2, grid.words), np.uint64)
+        self._shift = grid.shift
+        self._planes = empty_planes(grid, HOP_PLANES)
         self._counted = np.zeros(grid.height, np.bool_)  # rows with events
         self._used = np.full(grid.height, BRANCHLESS)  # planes of a row that may have bits
 
     def add(self, code: NDArray[np.uint32]) -> None:
         """Count events, ``(n,)`` uint32; see the module's head."""
-        _count(code, self._shift, self._words, self._planes.reshape(-1), self._counted, self._used)
+        _count(code, self._shift, self._planes, self._counted, self._used)
 
     def take(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.uint64]]:
         """Return the rows that have events and their planes, see :class:`HopEvents`, and begin anew."""
         rows = np.flatnonzero(self._counted)
         self._counted[rows] = False
-        first = _find_planes(rows, self._planes, self._used)
-        planes = np.empty(first[-1], np.uint64)
-        _take(rows, first, self._planes.reshape(len(self._planes), -1), planes)
-        return rows, first, planes
+        return rows, *_take(rows, self._planes, self._used)
 
 
 @njit(cache=True, nogil=True)
-def _count(code, shift, words, planes, counted, used):  # type: ignore[no-untyped-def]
+def _count(code, shift, images, counted, used):  # type: ignore[no-untyped-def]
     """Add one to the count of each event's pixel and polarity: to the first planes without a branch, then the few carries."""
+    words, planes = images.shape[4], images.reshape(-1)
     step = np.uint64(2 * words)  # from a plane to the next one
+    place, bit = np.empty(_BLOCK, np.uint32), np.empty(_BLOCK, np.uint64)
     carried, n = np.empty(len(code), np.uint32), np.uint64(0)  # unsigned, so that no place is taken to count from the end
+    for start in range(0, len(code), _BLOCK):
+        block = code[start : start + _BLOCK]
+        _find_places(block, shift, words, place, bit)
+        for i in range(len(block)):
+            counted[_row_of(block[i], shift)] = True
+            first = np.uint64(place[i])
+            second = first + step
+            carry = planes[first] & bit[i]
+            planes[first] ^= bit[i]
+            carried[n] = block[i]
+            n += np.uint64((planes[second] & carry) != 0)
+            planes[second] ^= carry
+    for start in range(0, n, _BLOCK):
+        block = carried[start : min(start + _BLOCK, n)]
+        _find_places(block, shift, words, place, bit)
+        for i in range(len(block)):
+            y = _row_of(block[i], shift)
+            x = (block[i] >> np.uint32(CODE_BITS)) & np.uint32((1 << shift) - 1)
+            used[y] = max(used[y], _carry_on(images, y, block[i] & np.uint32(ON), x >> np.uint32(WORD_SHIFT), bit[i]))
+
+
+@njit(cache=True, nogil=True)
+def _row_of(code, shift):  # type: ignore[no-untyped-def]
+    return code >> np.uint32(CODE_BITS + shift)
+
+
+@njit(cache=True, nogil=True)
+def _find_places(code, shift, words, place, bit):  # type: ignore[no-untyped-def]
+    """Write the place of each code's word in the first plane, and its bit: all at once, where the compiler can."""
+    row_size, columns = np.uint32((2 << GROUP_SHIFT) * words), np.uint32((1 << shift) - 1)
     for i in range(len(code)):
-        y, at, bit = _place(code[i], shift, words, step)
-        counted[y] = True
-        carry = planes[at] & bit
-        planes[at] ^= bit
-        at += step
-        carried[n] = code[i]
-        n += np.uint64((planes[at] & carry) != 0)
-        planes[at] ^= carry
-    for i in range(n):
-        y, at, bit = _place(carried[i], shift, words, step)
-        used[y] = max(used[y], _carry_on(planes, at, step, bit))
+        x = (code[i] >> np.uint32(CODE_BITS)) & columns
+        word = (code[i] & np.uint32(ON)) * np.uint32(words) + (x >> np.uint32(WORD_SHIFT))
+        place[i] = _row_of(code[i], shift) * row_size + word
+        bit[i] = np.uint64(1) << np.uint64(x & np.uint32((1 << WORD_SHIFT) - 1))
 
 
 @njit(cache=True, nogil=True)
-def _place(code, shift, words, step):  # type: ignore[no-untyped-def]
-    """Return the row of a code, its word of the first plane, and its bit."""
-    pixel = np.uint64(code >> np.uint32(CODE_BITS))
-    y, x = pixel >> np.uint64(shift), pixel & np.uint64((1 << shift) - 1)
-    at = y * np.uint64(HOP_PLANES) * step + np.uint64(code & np.uint32(ON)) * np.uint64(words) + (x >> np.uint64(WORD_SHIFT))
-    return y, at, np.uint64(1) << (x & np.uint64((1 << WORD_SHIFT) - 1))
-
-
-@njit(cache=True, nogil=True)
-def _carry_on(planes, at, step, bit):  # type: ignore[no-untyped-def]
+def _carry_on(images, y, polarity, word, bit):  # type: ignore[no-untyped-def]
     """Carry a bit into the planes behind those; return how many are used.  A count that is full stays so."""
     for plane in range(BRANCHLESS, HOP_PLANES):
-        place = at + np.uint64(plane) * step
-        planes[place] ^= bit
-        if planes[place] & bit:
+        held = images[plane >> GROUP_SHIFT, y, plane & _IN_GROUP, polarity, word]
+        images[plane >> GROUP_SHIFT, y, plane & _IN_GROUP, polarity, word] = held ^ bit
+        if not held & bit:
             return plane + 1
     for plane in range(HOP_PLANES):
-        planes[at + np.uint64(plane) * step] |= bit
+        images[plane >> GROUP_SHIFT, y, plane & _IN_GROUP, polarity, word] |= bit
     return HOP_PLANES
 
 
 @njit(cache=True, nogil=True)
-def _find_planes(rows, planes, used):  # type: ignore[no-untyped-def]
-    """Return where the planes of some rows, without the empty ones behind the last, are to begin; forget how many are used."""
+def _take(rows, images, used):  # type: ignore[no-untyped-def]
+    """Move the planes of some rows, without the last ones if these are empty, to an array; return where each begins, and it."""
+    height, width, planes = images.shape[1], 2 * images.shape[4], images.reshape(-1)
     first = np.zeros(len(rows) + 1, np.int64)
     for k in range(len(rows)):
-        y = rows[k]
-        n = used[y]
-        while n and not planes[y, n - 1].any():
+        n = used[rows[k]]
+        used[rows[k]] = BRANCHLESS
+        while n and not _has_bits(planes, plane_at(n - 1, rows[k], height, width), width):
             n -= 1
-        used[y] = BRANCHLESS
-        first[k + 1] = first[k] + n * 2 * planes.shape[3]
-    return first
+        first[k + 1] = first[k] + n * width
+    taken = np.empty(first[-1], np.uint64)
+    for k in range(len(rows)):
+        to = np.uint64(first[k])
+        for plane in range((first[k + 1] - first[k]) // width):
+            at = plane_at(plane, rows[k], height, width)
+            for i in range(np.uint64(width)):
+                taken[to + i] = planes[at + i]
+                planes[at + i] = 0
+            to += np.uint64(width)
+    return first, taken
 
 
 @njit(cache=True, nogil=True)
-def _take(rows, first, planes, taken):  # type: ignore[no-untyped-def]
-    """Move the planes of some rows to ``taken``."""
-    for k in range(len(rows)):
-        start, size = first[k], first[k + 1] - first[k]
-        row = planes[rows[k]]
-        for i in range(size):
-            taken[start + i] = row[i]
-            row[i] = 0
+def _has_bits(planes, at, width):  # type: ignore[no-untyped-def]
+    some = np.uint64(0)
+    for i in range(np.uint64(width)):
+        some |= planes[at + i]
+    return some != 0
+
+
+@njit(cache=True, nogil=True)
+def plane_at(plane, y, height, width):  # type: ignore[no-untyped-def]
+    """Return the place of the first of a row's ``width`` words, OFF and ON, of a plane of an image, which is flat."""
+    return np.uint64((((plane >> GROUP_SHIFT) * height + y) << GROUP_SHIFT | plane & _IN_GROUP) * width)

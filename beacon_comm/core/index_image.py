@@ -13,7 +13,9 @@ All windows lie on one grid of hops that is absolute in event time and end at th
 
 A window is kept as bit planes of its pixels' counts (:mod:`.hop_events` numbers them and counts each hop alike):
 
-    planes  uint64  row after row: [bit 0 of OFF | bit 0 of ON | bit 1 of OFF | …]        n = on + off, Σσ = on - off
+    planes  uint64  row after row: [bit 0 of OFF | bit 0 of ON | … | bit 3 of ON]; then bits 4 to 7; …
+
+    n = on + off, Σσ = on - off
 
 A hop adds its counts and subtracts those of the hop that leaves, plane by plane until no carry is left, a row at a time and
 only rows that have any.  There it looks for the pixels with as many events as the lower threshold
@@ -33,10 +35,20 @@ from numba import njit
 from numpy.typing import NDArray
 
 from beacon_comm.core.events import NS_PER_S
-from beacon_comm.core.hop_events import HOP_PLANES, WORD_SHIFT, HopEvents, PixelGrid, no_events
+from beacon_comm.core.hop_events import (
+    GROUP_SHIFT,
+    HOP_PLANES,
+    WORD_SHIFT,
+    HopEvents,
+    PixelGrid,
+    empty_planes,
+    no_events,
+    plane_at,
+)
 from beacon_comm.core.parameters import Parameters
 
 _WORD = 1 << WORD_SHIFT
+_IN_GROUP = (1 << GROUP_SHIFT) - 1
 _ALL, _NONE = np.uint64(0xFFFF_FFFF_FFFF_FFFF), np.uint64(0)
 _MOST_EVENTS = 1 << 40  # no window has more
 
@@ -47,8 +59,8 @@ class Window:
 
     Attributes:
         hops: its length.
-        planes: bits of the OFF, then of the ON events of every pixel, ``(height, planes, 2, words)`` uint64; see the module's
-            head.
+        planes: bits of the OFF, then of the ON events of every pixel, ``(groups, height, 4, 2, words)`` uint64; see the
+            module's head.
         used: how many planes of a row may have bits, ``(height,)`` int64.
         low: whether a pixel is above the lower threshold, row by row, ``(height, stride / 64)`` uint64, bit x % 64 of
             word x / 64.
@@ -88,10 +100,9 @@ class IndexImages:
         self.overflow_events = 0
 
     def _empty_window(self, hops: int) -> Window:
-        height, words = self.grid.height, self.grid.words
-        planes = np.zeros((height, HOP_PLANES + hops.bit_length(), 2, words), np.uint64)
-        low = np.zeros((height, self.grid.stride >> WORD_SHIFT), np.uint64)
-        return Window(hops, planes, np.zeros(height, np.int64), low)
+        low = np.zeros((self.grid.height, self.grid.stride >> WORD_SHIFT), np.uint64)
+        planes = empty_planes(self.grid, HOP_PLANES + hops.bit_length())
+        return Window(hops, planes, np.zeros(self.grid.height, np.int64), low)
 
     @property
     def empty(self) -> bool:
@@ -144,8 +155,9 @@ class IndexImages:
 
     def counts(self, window: Window) -> NDArray[np.int64]:
         """Return the OFF, then the ON events of the sensor's pixels, ``(2, height, width)`` int64."""
-        bits = np.unpackbits(window.planes.astype('<u8').view(np.uint8), axis=-1, bitorder='little')[..., : self.grid.width]
-        return np.tensordot(1 << np.arange(bits.shape[1]), bits, (0, 1)).transpose(1, 0, 2)
+        planes = window.planes.transpose(0, 2, 3, 1, 4).reshape(-1, 2, self.grid.height, self.grid.words)
+        bits = np.unpackbits(planes.astype('<u8').view(np.uint8), axis=-1, bitorder='little')[..., : self.grid.width]
+        return np.tensordot(1 << np.arange(len(bits)), bits, (0, 0))
 
     def low_pixels(self, window: Window) -> NDArray[np.bool_]:
         """Return which pixels are above the lower threshold, ``(height, width)`` bool."""
@@ -176,8 +188,9 @@ def pixel_counts(planes, used, y, x):  # type: ignore[no-untyped-def]
     word, place = x >> WORD_SHIFT, np.uint64(x & (_WORD - 1))
     off, on = _NONE, _NONE
     for plane in range(used[y]):
-        off |= ((planes[y, plane, 0, word] >> place) & np.uint64(1)) << np.uint64(plane)
-        on |= ((planes[y, plane, 1, word] >> place) & np.uint64(1)) << np.uint64(plane)
+        row = planes[plane >> GROUP_SHIFT, y, plane & _IN_GROUP]
+        off |= ((row[0, word] >> place) & np.uint64(1)) << np.uint64(plane)
+        on |= ((row[1, word] >> place) & np.uint64(1)) << np.uint64(plane)
     return np.int64(off), np.int64(on)
 
 
@@ -187,8 +200,7 @@ def _slide(  # type: ignore[no-untyped-def]
 ):
     """Take the counts that leave off and add those that come, row by row; find the low pixels of these rows again."""
     fewest = np.int64(min(max(1.0, np.ceil(low * offset)), float(_MOST_EVENTS)))
-    depth, words = planes.shape[1], planes.shape[3]
-    flat = planes.reshape(-1)
+    height, words, flat = planes.shape[1], planes.shape[4], planes.reshape(-1)
     carry, many = np.empty(2 * words, np.uint64), np.empty(words, np.uint64)
     counts, is_low = np.empty((2, _WORD), np.int64), np.empty(_WORD, np.uint64)
     i = j = 0
@@ -196,24 +208,23 @@ def _slide(  # type: ignore[no-untyped-def]
         goes = i < len(gone_rows) and (j >= len(came_rows) or gone_rows[i] <= came_rows[j])
         comes = j < len(came_rows) and (i >= len(gone_rows) or came_rows[j] <= gone_rows[i])
         y = came_rows[j] if comes else gone_rows[i]
-        row = np.uint64(y * depth * 2 * words)
         if goes:
-            _change(flat, row, gone, gone_first[i], gone_first[i + 1], _ALL, carry)
+            _change(flat, y, height, gone, gone_first[i], gone_first[i + 1], _ALL, carry)
             i += 1
         if comes:
-            changed = _change(flat, row, came, came_first[j], came_first[j + 1], _NONE, carry)
+            changed = _change(flat, y, height, came, came_first[j], came_first[j + 1], _NONE, carry)
             used[y] = max(used[y], changed)
             j += 1
-        used[y] = _find_many(flat, row, used[y], fewest, many, carry)
+        used[y] = _find_many(flat, y, height, used[y], fewest, many, carry)
         for word in range(words):
             low_bits[y, word] = _NONE
             if many[word]:
-                _unpack(planes[y, :, :, word], used[y], counts)
+                _unpack(planes[:, y, :, :, word], used[y], counts)
                 low_bits[y, word] = _find_low(counts, low, offset, is_low)
 
 
 @njit(cache=True, nogil=True)
-def _change(planes, row, by, start, stop, flip, carry):  # type: ignore[no-untyped-def]
+def _change(planes, y, height, by, start, stop, flip, carry):  # type: ignore[no-untyped-def]
     """Add the counts ``by[start:stop]`` to a row's, or take them off: ``flip`` 0, or all bits; return how many planes changed.
 
     Both carry alike, but that a difference borrows where the bit that it is taken off is not set.
@@ -221,30 +232,32 @@ def _change(planes, row, by, start, stop, flip, carry):  # type: ignore[no-untyp
     width = np.uint64(len(carry))
     for k in range(width):
         carry[k] = _NONE
-    at, of = row, np.uint64(start)
+    of, plane = np.uint64(start), 0
     while of < np.uint64(stop):
+        at = plane_at(plane, y, height, len(carry))
         for k in range(width):
-            held, other, more = planes[at + np.uint64(k)], by[of + np.uint64(k)], carry[k]
-            planes[at + np.uint64(k)] = held ^ other ^ more
+            held, other, more = planes[at + k], by[of + k], carry[k]
+            planes[at + k] = held ^ other ^ more
             able = held ^ flip
             carry[k] = (able & other) | (more & (able ^ other))
-        at += width
         of += width
+        plane += 1
     while True:
         some = _NONE
         for k in range(width):
             some |= carry[k]
         if not some:
-            return np.int64((at - row) // width)
+            return plane
+        at = plane_at(plane, y, height, len(carry))
         for k in range(width):
-            held, more = planes[at + np.uint64(k)], carry[k]
-            planes[at + np.uint64(k)] = held ^ more
+            held, more = planes[at + k], carry[k]
+            planes[at + k] = held ^ more
             carry[k] = (held ^ flip) & more
-        at += width
+        plane += 1
 
 
 @njit(cache=True, nogil=True)
-def _find_many(planes, row, used, fewest, many, carry):  # type: ignore[no-untyped-def]
+def _find_many(planes, y, height, used, fewest, many, carry):  # type: ignore[no-untyped-def]
     """Find the pixels of a row that have so many events, one bit each; return how many planes have bits.
 
     From the lowest bit on: with those so far, a sum is as large as ``fewest`` if the next bit of both is the same and it was
@@ -256,11 +269,11 @@ def _find_many(planes, row, used, fewest, many, carry):  # type: ignore[no-untyp
     full = 0
     for plane in range(used):
         some = _NONE
-        off_at = row + np.uint64(2 * plane) * words
+        off_at = plane_at(plane, y, height, len(carry))
         on_at = off_at + words
         passed = np.uint64(((fewest >> plane) & 1) - 1)  # all bits where the next one of ``fewest`` is 0
         for k in range(words):
-            off, on, more = planes[off_at + np.uint64(k)], planes[on_at + np.uint64(k)], carry[k]
+            off, on, more = planes[off_at + k], planes[on_at + k], carry[k]
             half = off ^ on
             bit = half ^ more
             some |= off | on
@@ -276,12 +289,12 @@ def _find_many(planes, row, used, fewest, many, carry):  # type: ignore[no-untyp
 
 @njit(cache=True, nogil=True)
 def _unpack(planes, used, counts):  # type: ignore[no-untyped-def]
-    """Write the OFF and ON events of a word's 64 pixels; ``planes``: its words."""
+    """Write the OFF and ON events of a word's 64 pixels; ``planes``: its bits, ``(groups, 4, 2)``."""
     for polarity in range(2):
         for k in range(_WORD):
             counts[polarity, k] = 0
         for plane in range(used):
-            bits = planes[plane, polarity]
+            bits = planes[plane >> GROUP_SHIFT, plane & _IN_GROUP, polarity]
             for k in range(_WORD):
                 counts[polarity, k] |= np.int64((bits >> np.uint64(k)) & np.uint64(1)) << plane
 

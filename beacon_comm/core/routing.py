@@ -89,20 +89,28 @@ class Router:
         """Return the events of each track that got any, in order of the tracks' labels."""
         if len(segment) == 0:
             return []
-        segment = self._on_sensor(segment)
-        n, start = len(segment), self._gathered
-        if start + n > len(self._code):
-            self._make_room(n)
+        start = self._gathered
+        if not self._pack(segment):
+            segment = self._on_sensor(segment)
+            self._pack(segment)
+        n = len(segment)
         code = self._code[start : start + n]
-        _pack(
-            segment.x, segment.y, segment.polarity, segment.t_ns, self._grid.shift, self._t_hop_ns,
-            code, self._offset_ns[start : start + n],
-        )  # fmt: skip
         routed = self._own(segment, code) if self._track_ids else []
         kept = self._keep(start, n)
         self._counts.add(code[:kept])
         self._gathered += kept
         return routed
+
+    def _pack(self, segment: EventBatch) -> bool:
+        """Write the segment's codes and times behind those gathered; return whether all of it lies on the sensor."""
+        n, start, grid = len(segment), self._gathered, self._grid
+        if start + n > len(self._code):
+            self._make_room(n)
+        outside = _pack(
+            segment.x, segment.y, segment.polarity, segment.t_ns, grid.width, grid.height, grid.shift, self._t_hop_ns,
+            self._code[start : start + n], self._offset_ns[start : start + n],
+        )  # fmt: skip
+        return not outside
 
     def _keep(self, start: int, n: int) -> int:
         """Return how many of the ``n`` events from ``start`` on are left for the windows."""
@@ -113,12 +121,8 @@ class Router:
 
     def _on_sensor(self, segment: EventBatch) -> EventBatch:
         """Return the segment without the events beyond the sensor's borders."""
-        width, height = self._grid.width, self._grid.height
-        outside = _count_outside(segment.x, segment.y, width, height)
-        if outside == 0:
-            return segment
-        self.outside_events += outside
-        kept = (segment.x < width) & (segment.y < height)
+        kept = (segment.x < self._grid.width) & (segment.y < self._grid.height)
+        self.outside_events += len(kept) - int(np.count_nonzero(kept))
         return EventBatch(
             segment.x[kept], segment.y[kept], segment.polarity[kept], segment.t_ns[kept], segment.t_end_ns
         )
@@ -167,20 +171,15 @@ class Router:
 
 
 @njit(cache=True, nogil=True)
-def _count_outside(x, y, width, height):  # type: ignore[no-untyped-def]
+def _pack(x, y, polarity, t_ns, width, height, shift, t_hop_ns, code, offset_ns):  # type: ignore[no-untyped-def]
+    """Write each event's code, and its time since the hop's begin; return how many lie beyond the sensor's borders."""
     outside = 0
     for i in range(len(x)):
         outside += (x[i] >= width) | (y[i] >= height)
-    return outside
-
-
-@njit(cache=True, nogil=True)
-def _pack(x, y, polarity, t_ns, shift, t_hop_ns, code, offset_ns):  # type: ignore[no-untyped-def]
-    """Write each event's code, and its time since the hop's begin."""
-    for i in range(len(x)):
         pixel = (np.uint32(y[i]) << np.uint32(shift)) | np.uint32(x[i])
         code[i] = (pixel << np.uint32(CODE_BITS)) | np.uint32(polarity[i] > 0)
         offset_ns[i] = t_ns[i] - t_hop_ns
+    return outside
 
 
 @njit(cache=True, nogil=True)
