@@ -1,5 +1,7 @@
 """Acquisition: a beacon is found with its rate, its phase and its polarity, and nothing else is."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,12 +14,15 @@ from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.likelihood import CONTEXTS, COUNTS, LEVELS
 from beacon_comm.core.rate_search import periods_around
 from beacon_comm.core.trellis import frame_layout
-from beacon_comm.simulation.led import noise, square_wave
+from beacon_comm.simulation.led import OUTDOOR_30_M, noise, square_wave
 
 TEXT = "Rough winds do shake the darling buds of May,\nAnd summer's lease"
 RATES = (100.0, 504.0, 1000.0, 3125.0, 8000.0)
 FRAME = CharacterFrame()
 LAYOUT = frame_layout(FRAME)
+# Nearby: a large disc, which has as many ON as OFF events while a level is held.
+NEAR = replace(OUTDOOR_30_M, rise=replace(OUTDOOR_30_M.rise, held_per_s=0.0), fall=replace(OUTDOOR_30_M.fall, held_per_s=0.0))
+NEAR = replace(NEAR, stray_per_s=4000.0)
 
 
 def found(events, periods, needed=4, layout=LAYOUT):
@@ -68,6 +73,16 @@ def test_latencies_are_those_of_the_edges():
     assert 0.0 <= lock.clock['border'][0] % 1e6 < 1e6
     # The edges of a bit lie in it, or a little before.
     assert (lock.clock['latencies'] >= -0.3e6).all() and (lock.clock['latencies'] <= 0.7e6).all()
+
+
+@pytest.mark.parametrize('begins_at', np.arange(0.0, 1.0, 0.125))
+def test_bursts_far_shorter_than_a_bit_are_kept_off_its_borders(begins_at):
+    # At 20 bps a burst is over in a hundredth of a bit: the eye is open at every phase.
+    t_ns, polarity = beacon(TEXT[:8], 20.0, model=NEAR)
+    later = t_ns >= t_ns[0] + begins_at * NS / 20.0
+    lock = found((t_ns[later], polarity[later]), [NS / 20.0])
+    assert lock.verdict.passing >= 7 and lock.verdict.spread < 0.02
+    assert lock.clock['latencies'][0] / lock.period == pytest.approx(0.375, abs=0.05)
 
 
 @pytest.mark.parametrize('bit_rate_bps', RATES)

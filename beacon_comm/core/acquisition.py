@@ -3,7 +3,8 @@
 For a period T near the expected one, over a window of some characters::
 
     1. eye       Σ over bits |ON − OFF| at 16 phases; the phase is the middle of the interval where the eye is within
-                 95 % of its best: it falls off a cliff on the late side
+                 95 % of its best: it falls off a cliff on the late side.  Where bursts are far shorter than a bit it is
+                 open nearly everywhere: there bits begin so that bursts lie in the middle of a sub-slot
     2. slicer    bit = more ON or more OFF; few events: as the bit before
     3. learning  histograms from the bits, bits from the histograms: free, then under the frame
     4. verdict   how many words of the framed path are also what the free bits say: those could have failed, as the
@@ -36,6 +37,11 @@ EYE_STEPS = 64
 
 EYE_SHARE = 0.95
 """The eye is open where it is within this share of its best."""
+
+MOST_CLOSED, LEAST_TOGETHER, BURST_PLACE = 1, 0.5, 0.375
+"""Where no more phases than the first are closed, the middle of the open ones is anywhere, near the bursts or not: if these are
+together, 0 to 1, by more than the second, bits begin so that they lie at the third (bit), far from the borders of bits and
+sub-slots.  At the right rate they are by 0.9 and more, at others by some 0.1."""
 
 REFERENCE_EVENTS = 100.0
 """Counts of signals with more events a bit are divided down to so many."""
@@ -284,7 +290,7 @@ def _read(
     needed: int,
 ) -> Lock | None:
     length = int(layout['length'][0])
-    border = start + (_phase(_eye(_fine(t, polarity, start, period, stop))) - 1.0) * period
+    border = start + (_phase(_fine(t, polarity, start, period, stop)) - 1.0) * period
     bits = int((stop - border) / period) + 1
     raw = _counts(t, polarity, border, period, bits)
     gain = max(1.0, raw.sum() / bits / REFERENCE_EVENTS)
@@ -389,16 +395,35 @@ def _eyes(t, polarity, start, periods, stop):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _phase(eye):  # type: ignore[no-untyped-def]
-    """Return the middle of the open interval around the best phase, in bits, 0 to 1."""
+def _phase(bins):  # type: ignore[no-untyped-def]
+    """Return where bits begin (0 to 1 bit) by the signed events of a window; see the module's head."""
+    eye = _eye(bins)
     best = np.argmax(eye)
     least = EYE_SHARE * eye[best]
+    if (eye < least).sum() <= MOST_CLOSED:
+        burst, together = _bursts(bins)
+        if together > LEAST_TOGETHER:
+            return (burst - BURST_PLACE) % 1.0
     early, late = 0, 0
     while early < PHASES // 2 and eye[(best - early - 1) % PHASES] >= least:
         early += 1
     while late < PHASES // 2 and eye[(best + late + 1) % PHASES] >= least:
         late += 1
     return ((best + 0.5 * (late - early)) % PHASES) / PHASES
+
+
+@njit(cache=True, nogil=True)
+def _bursts(bins):  # type: ignore[no-untyped-def]
+    """Return where in the bits the bursts lie (bit), and how much together: 1 in one bin, 0 anywhere.
+
+    Signed events count squared, so that bursts outweigh the background.
+    """
+    power = np.zeros(PHASES)
+    for i in range(len(bins)):
+        power[i % PHASES] += bins[i] * bins[i]
+    angle = 2.0 * np.pi * (np.arange(PHASES) + 0.5) / PHASES
+    c, s = (power * np.cos(angle)).sum(), (power * np.sin(angle)).sum()
+    return np.arctan2(s, c) / (2.0 * np.pi), np.hypot(s, c) / max(power.sum(), 1.0)
 
 
 def _settled(t: NDArray[np.float64], polarity: NDArray[np.int8], start: float, period: float) -> float:
