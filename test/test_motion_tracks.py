@@ -73,6 +73,20 @@ def hops(tracker, count):
     return lost
 
 
+def test_a_track_whose_place_is_known_keeps_its_blob_from_one_that_may_be_anywhere():
+    tracker = MotionTracker(Parameters(), (640, 480))
+    read, unsure = track_at(1, 200.0, bit_rate_bps=20.0), track_at(2, 205.0)
+    for k in range(1, 51):
+        read.observe(200.0, 100.0, T0_NS + k * 100_000, 0.05)
+    unsure.begin(205.0, 100.0, T0_NS, 0.1, 4e4)  # it has just begun, at an unknown velocity
+    for track in (read, unsure):
+        tracker._tracks[track.track_id] = track
+        track.row[[motion.HOP_ON, motion.HOP_OFF]] = 0.0  # a held bit
+    held = Blob(200.2, 100.0, T0_NS, 4.0, 1.0, 4000, 50, 0, False, 1)
+    tracker.update([held], T0_NS + 2 * HOP_NS)
+    assert not read.quiet and unsure.quiet
+
+
 @pytest.mark.parametrize(
     ('rates', 'age_s', 'lost'),
     [

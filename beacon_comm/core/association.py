@@ -1,7 +1,7 @@
 """Association: which blob is of which track, all together.
 
 Of all ways to give blobs to the tracks in whose gates they lie, each at most once, the one with the most pairs, and of these
-the one with the least sum of squared distances over their variances.  Tracks and blobs that can be given to nobody else
+the likeliest, the one with the least sum of costs.  Tracks and blobs that can be given to nobody else
 are matched at once; the assignment problem (Kuhn, 1955) is solved for each group that competes.
 """
 
@@ -23,7 +23,7 @@ def assign(
 
     Args:
         first, second: the pairs that may be, ``(n,)``.
-        cost: of each, from 0 to far below 10¹², ``(n,)``.
+        cost: of each, -2 log of its likelihood and a constant, from 0 to far below 10¹², ``(n,)``.
         shape: how many first and second ones there are.
     """
     if np.bincount(first).max(initial=0) <= 1 and np.bincount(second).max(initial=0) <= 1:

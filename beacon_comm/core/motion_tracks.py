@@ -356,12 +356,13 @@ class MotionTracker(Tracker):
     def _matched(
         self, tracks: list[MotionTrack], blobs: Sequence[Blob], t_hop_ns: int
     ) -> tuple[list[int], list[int]]:
-        """Return each track's blob and each blob's track, -1 for none: the best assignment within the gates."""
+        """Return each track's blob and each blob's track, -1 for none: the likeliest assignment within the gates."""
         blob_of, track_of = [-1] * len(tracks), [-1] * len(blobs)
         first, second, distance2 = self._gated(tracks, positions_at(tracks, t_hop_ns), blobs, t_hop_ns)
         variance = np.array([track.variance_at(t_hop_ns) for track in tracks])
         seen = np.array([blob.variance_px2 + 1.0 for blob in blobs])
-        cost = distance2 / (variance[first] + seen[second]) if len(first) else distance2
+        both = variance[first] + seen[second]
+        cost = distance2 / both + 2.0 * np.log(both)  # of a normal density: what may be anywhere is hardly just here
         for i, j in assign(first, second, cost, (len(tracks), len(blobs))):
             blob_of[i], track_of[j] = j, i
         return blob_of, track_of
