@@ -54,8 +54,9 @@ from beacon_comm.ros.topic import (
 NODE_NAME = 'beacon_node'
 GRAPH_PERIOD_S = 0.25
 REPORT_PERIOD_S = 1.0
-LONGEST_TURN_S = 0.005
-"""Messages are read, and waited for, for so long before timers, /clock and the graph's news have their turn."""
+LONGEST_TURN_S = 0.02
+"""Messages are read, and waited for, until it is time to publish, but for no longer before other timers, /clock and the graph's
+news have their turn."""
 LOG_PERIOD_NS = NS_PER_S
 SILENCE_LOG_PERIOD_NS = 10 * NS_PER_S
 ACKNOWLEDGED_WITHIN = Duration(nanoseconds=NS_PER_S // 5)
@@ -151,7 +152,7 @@ class BeaconNode(Node):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._tick_s = own.silent_clock_after_s / 2.0
         self.create_timer(self._tick_s, self._on_tick, clock=steady)
-        self.create_timer(1.0 / own.publish_rate_hz, self._on_publish, clock=steady)
+        self._publish_timer = self.create_timer(1.0 / own.publish_rate_hz, self._on_publish, clock=steady)
         self.create_timer(GRAPH_PERIOD_S, self._on_graph, clock=steady)
         self.create_timer(REPORT_PERIOD_S, self._on_report, clock=steady)
         backwards = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True)
@@ -164,7 +165,7 @@ class BeaconNode(Node):
     @guarded
     def _on_message(self, cdr: bytes, info: dict[str, int]) -> None:
         # A turn of the executor takes as long as reading a packet: messages that wait, or come soon, are read in the same one.
-        stop_s = time.monotonic() + LONGEST_TURN_S
+        stop_s = time.monotonic() + min(LONGEST_TURN_S, (self._publish_timer.time_until_next_call() or 0) / NS_PER_S)
         self._read(cdr, info)
         while (left_s := stop_s - time.monotonic()) > 0.0 and self._queue is not None:
             if (waiting := self._queue.take(left_s)) is not None:
