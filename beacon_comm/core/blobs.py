@@ -41,7 +41,7 @@ from beacon_comm.core.components import (
 )  # fmt: skip
 from beacon_comm.core.hop_events import CODE_BITS, HopEvents, PixelGrid
 from beacon_comm.core.index_image import IndexImages, Window, hop_length_ns, pixel_counts
-from beacon_comm.core.nearest import CELL_SHIFT, cells_with_members, list_cells
+from beacon_comm.core.nearest import CELL_SHIFT, cells_with_members, events_in, list_cells
 from beacon_comm.core.parameters import Parameters
 
 FRESH_EVENTS = 4  # fewer new events say nothing about the position …
@@ -101,6 +101,7 @@ class BlobFinder:
     Attributes:
         owner: for every pixel number, 1 + the number of the blob in the last :meth:`find`'s list that it is of,
             0 for none, -1 for a component that is too large, int32.
+        box: of each of these blobs: left, right, top, bottom (px, inclusive), ``(m, 4)`` float64.
     """
 
     def __init__(self, parameters: Parameters, sensor_size: tuple[int, int]) -> None:
@@ -110,6 +111,7 @@ class BlobFinder:
         self._finders = [ComponentFinder(parameters, self._grid) for _ in range(2)]
         self._sets: list[ComponentSet] = []
         self.owner = np.zeros(self._grid.numbers, np.int32)
+        self.box = np.empty((0, 4))
 
     def find(self, images: IndexImages, t_hop_ns: int) -> list[Blob]:
         """Return the blobs at the hop that ends at ``t_hop_ns`` (ns)."""
@@ -127,6 +129,7 @@ class BlobFinder:
             return []
         sums = np.concatenate([s.sums[c] for s, c in zip(self._sets, standing, strict=True)])
         index = np.concatenate([s.index[c] for s, c in zip(self._sets, standing, strict=True)])
+        self.box = sums[:, LEFT : BOTTOM + 1].astype(np.float64)
         length = np.array([w.hops for w in images.windows])
         return self._observe(window, sums, index, length, images.newest, t_hop_ns)
 
@@ -276,17 +279,7 @@ def _long_stands(run, first, fits, short_label, short_fits, planes, used, shift)
 def _sum_newest(code, offset_ns, shift, cells_across, first, member, circle, owner):  # type: ignore[no-untyped-def]
     """Return n, Σx, Σy, Σ(x² + y²), Σ(t - hop's begin) of each blob's newest events, ``(m, 5)`` int64."""
     sums = np.zeros((len(circle), 5), np.int64)
-    has_circle = cells_with_members(first)
-    index = np.empty(len(code), np.int32)
-    row_shift, column_shift = np.uint32(CODE_BITS + shift + CELL_SHIFT), np.uint32(CODE_BITS + CELL_SHIFT)
-    columns = np.uint32((1 << (shift - CELL_SHIFT)) - 1)
-    near = np.uint64(0)  # unsigned, so that no place is taken to count from the end
-    for i in range(len(code)):
-        cell = np.uint64(code[i] >> row_shift) * np.uint64(cells_across) + np.uint64((code[i] >> column_shift) & columns)
-        index[near] = i
-        near += np.uint64(has_circle[cell])
-    for j in range(near):
-        event = np.uint64(index[j])
+    for event in events_in(cells_with_members(first), cells_across, code, shift):
         p = np.int64(code[event] >> np.uint32(CODE_BITS))
         y = p >> shift
         x = p - (y << shift)

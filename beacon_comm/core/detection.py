@@ -25,6 +25,7 @@ from beacon_comm.core.following import FollowingRouter
 from beacon_comm.core.hop_events import CODE_BITS, ON, ROUTED
 from beacon_comm.core.index_image import IndexImages, hop_length_ns
 from beacon_comm.core.motion_tracks import MotionTracker
+from beacon_comm.core.nearest import cell_lists, cells_along, cells_with_members, events_in
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.routing import Routed, Router
 from beacon_comm.core.tracks import Track, TrackChanges, Tracker
@@ -211,13 +212,19 @@ class Detector:
         begun = dict(zip(changes.new_blobs, changes.new, strict=False))  # behind them: the renamed ones
         for track in begun.values():
             self._buffers[track.track_id] = EventBuffer(self._buffer_ns, self._parameters.buffer_max_bytes)
+        grid = self._images.grid
         for w, window in enumerate(self._images.windows):
             wanted = np.zeros(len(blobs) + 1, np.bool_)
             wanted[[b + 1 for b in begun if blobs[b].window == w]] = True
             if not wanted.any():
                 continue
+            first, _ = cell_lists(self._blobs.box[wanted[1:]], grid.width, grid.height)
+            cells, across = cells_with_members(first), cells_along(grid.width)
             parts = [
-                _events_on(events.code, events.offset_ns, events.t_start_ns, self._blobs.owner, wanted)
+                _events_on(
+                    events_in(cells, across, events.code, grid.shift),
+                    events.code, events.offset_ns, events.t_start_ns, self._blobs.owner, wanted,
+                )  # fmt: skip
                 for events in self._images.hop_events(window)
                 if len(events)
             ]
@@ -230,13 +237,13 @@ class Detector:
 
 
 @njit(cache=True, nogil=True)
-def _events_on(code, offset_ns, t_start_ns, owner, wanted):  # type: ignore[no-untyped-def]
-    """Return blob number, time and polarity of the events that no track got and that lie on a wanted blob."""
-    number = np.empty(len(code), np.int32)
-    t_ns = np.empty(len(code), np.int64)
-    polarity = np.empty(len(code), np.int8)
+def _events_on(index, code, offset_ns, t_start_ns, owner, wanted):  # type: ignore[no-untyped-def]
+    """Return blob number, time and polarity of those events of ``index`` that no track got and that lie on a wanted blob."""
+    number = np.empty(len(index), np.int32)
+    t_ns = np.empty(len(index), np.int64)
+    polarity = np.empty(len(index), np.int8)
     n = 0
-    for i in range(len(code)):
+    for i in index:
         c = np.int64(code[i])
         b = owner[c >> CODE_BITS]
         if b > 0 and wanted[b] and not c & ROUTED:

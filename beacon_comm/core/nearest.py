@@ -11,6 +11,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from beacon_comm.core.hop_events import CODE_BITS
+
 CELL_SHIFT = 4
 
 
@@ -69,3 +71,17 @@ def cells_with_members(first):  # type: ignore[no-untyped-def]
     for cell in range(len(some)):
         some[cell] = first[cell] != first[cell + 1]
     return some
+
+
+@njit(cache=True, nogil=True)
+def events_in(some, across, code, shift):  # type: ignore[no-untyped-def]
+    """Return which events of a hop lie in cells that are set in ``some``, ``(n,)`` uint32; ``shift``: the pixel grid's."""
+    index = np.empty(len(code), np.uint32)
+    row_shift, column_shift = np.uint32(CODE_BITS + shift + CELL_SHIFT), np.uint32(CODE_BITS + CELL_SHIFT)
+    columns = np.uint32((1 << (shift - CELL_SHIFT)) - 1)
+    n = np.uint64(0)  # unsigned, so that no place is taken to count from the end
+    for i in range(len(code)):
+        cell = np.uint64(code[i] >> row_shift) * np.uint64(across) + np.uint64((code[i] >> column_shift) & columns)
+        index[n] = i
+        n += np.uint64(some[cell])
+    return index[:n]
