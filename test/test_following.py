@@ -260,6 +260,17 @@ def test_edges_that_pass_do_not_take_a_beacon_along(seed: int) -> None:
     assert detector.tracks[1].position_at(T0_NS + 600_000_000) == pytest.approx((160.0, 120.0), abs=1.0)
 
 
+def test_lights_of_a_single_pixel_side_by_side_are_followed() -> None:
+    """Their blobs have no extent, and their events may be of either."""
+    t_ns = T0_NS + np.arange(0, 300_000_000, 200_000)
+    polarity = np.where(np.arange(len(t_ns)) // 50 % 2, 1, -1)
+    lights = [batch(np.full(len(t_ns), x), np.full(len(t_ns), 20), polarity, t_ns + x) for x in (20, 22)]
+    detector = Detector(Parameters(min_area_px=1, closing_px=1), (60, 40))
+    detect(detector, merged(*lights))
+    places = sorted((round(track.x_px), round(track.y_px)) for track in detector.tracks.values())
+    assert places and set(places) <= {(20, 20), (21, 20), (22, 20)}
+
+
 def test_an_observation_that_is_far_off_for_once_is_doubted() -> None:
     def row(speed: float) -> np.ndarray:
         state = np.zeros(motion.WIDTH)

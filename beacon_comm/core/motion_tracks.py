@@ -457,8 +457,9 @@ class MotionTracker(Tracker):
         return blob.fills(self._parameters.min_fill)
 
     def _make(self, track_id: int, blob: Blob, t_hop_ns: int, tried_ns: int | None) -> Track:
+        extent_px = max(_LEAST_EXTENT_PX, blob.extent_px)  # that of a single pixel is 0
         track = MotionTrack(
-            track_id, blob.x_px, blob.y_px, blob.t_ns, blob.extent_px, blob.index, blob.t_ns, blob.t_ns,
+            track_id, blob.x_px, blob.y_px, blob.t_ns, extent_px, blob.index, blob.t_ns, blob.t_ns,
             matched_ns=t_hop_ns, tried_ns=tried_ns, origin_ns=t_hop_ns, latency_s=self._parameters.event_latency_s,
         )  # fmt: skip
         track.begin(blob.x_px, blob.y_px, blob.t_ns, blob.variance_px2 + FLOOR_PX**2, FIRST_SPEED_PX_PER_S**2)
