@@ -5,9 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from beacon_comm.compiling.cache import ensure_compiler_cache
+from beacon_comm.compiling.cache import ensure_compiler_cache, save_one_at_a_time
 
 ensure_compiler_cache()  # before anything imports numba
+save_one_at_a_time()
 
 PROJECT = Path(__file__).resolve().parents[1]
 

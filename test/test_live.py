@@ -240,3 +240,35 @@ def _cache_folder(cache: Path, temporary: Path, given: str | None = None) -> str
     }
     done = subprocess.run([sys.executable, '-c', program], env=environment, capture_output=True, text=True, check=True)
     return done.stdout.strip()
+
+
+def test_processes_that_save_kernels_of_one_function_at_once_get_their_own(tmp_path: Path) -> None:
+    (tmp_path / 'kernels.py').write_text(
+        'from numba import njit\n'
+        '@njit(cache=True)\n'
+        'def twice(x):\n'
+        '    return x + x\n'
+    )
+    program = (
+        'import sys\n'
+        'from beacon_comm.compiling.cache import save_one_at_a_time\n'
+        'save_one_at_a_time()\n'
+        'import numpy as np\n'
+        'from kernels import twice\n'
+        'for name in sys.argv[1:]:\n'
+        '    result = twice(np.dtype(name).type(3))\n'
+        '    assert result == 6, (name, result)\n'
+        'print(sum(twice.stats.cache_hits.values()))\n'
+    )
+    integers, others = ['int8', 'int16', 'int32', 'int64'], ['float32', 'float64', 'complex64', 'uint8']
+    environment = {**os.environ, 'PYTHONPATH': str(tmp_path), 'NUMBA_CACHE_DIR': str(tmp_path / 'cache')}
+    environment.pop('PYTHONSAFEPATH', None)
+    command = [sys.executable, '-c', program]
+    both = [
+        subprocess.Popen([*command, *names], env=environment, stdout=subprocess.PIPE, text=True) for names in (integers, others)
+    ]
+    for process in both:
+        process.communicate()
+        assert process.returncode == 0
+    done = subprocess.run([*command, *integers, *others], env=environment, capture_output=True, text=True, check=True)
+    assert int(done.stdout) == len(integers) + len(others)

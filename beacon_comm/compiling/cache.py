@@ -5,12 +5,18 @@ cached function where none of the three can be written: a robot that installs to
 a user without a home.  Then they go to the temporary folder.  It has to be called before numba is imported.
 
 Whether a kernel is out of date numba asks of the file alone that it stands in, not of what that imports, and it fails
-where a type that it remembers is gone.  So every version of the sources has a folder of its own, named after them.
+where a type that it remembers is gone.  So every version of the sources has a folder of its own, named after them (and after
+``NUMBA_BOUNDSCHECK``, which numba does not ask of either).
+
+Nor does numba expect two processes to save kernels of one function at the same time: the list that one of them writes may name
+the other's code, which then runs on arguments of other types.  So they are saved one at a time.
 """
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import functools
 import hashlib
 import os
 import re
@@ -22,6 +28,7 @@ from pathlib import Path
 PACKAGE = Path(__file__).absolute().parents[1]
 ROOMS = ('core', 'wire', 'simulation')
 _PREFIX = 'beacon_comm_kernels_'
+_LOCK = 'saving'
 _A_VERSION = re.compile(_PREFIX + '[0-9a-f]{16}')  # other folders are somebody's, and stay
 
 
@@ -50,7 +57,26 @@ def _version() -> str:
     for path in sorted(path for room in ROOMS for path in (PACKAGE / room).glob('*.py')):
         with contextlib.suppress(OSError):  # an editor's link to nowhere
             digest.update(path.read_bytes())
+    digest.update(os.environ.get('NUMBA_BOUNDSCHECK', '').encode())
     return _PREFIX + digest.hexdigest()[:16]
+
+
+def save_one_at_a_time() -> None:
+    """Let this process save kernels while no other one does that calls this, too; it imports numba."""
+    from numba.core.caching import IndexDataCacheFile
+
+    save = IndexDataCacheFile.save
+    if hasattr(save, 'alone'):
+        return
+
+    @functools.wraps(save)
+    def save_alone(self: IndexDataCacheFile, key: object, data: object) -> None:
+        with open(Path(self._cache_path) / _LOCK, 'wb') as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            save(self, key, data)
+
+    save_alone.alone = True  # type: ignore[attr-defined]
+    IndexDataCacheFile.save = save_alone
 
 
 def _delete_other_versions(folder: Path) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from beacon_comm.compiling.cache import save_one_at_a_time
 from beacon_comm.core.events import NS_PER_S, EventBatch
 from beacon_comm.core.framing import CharacterFrame, transitions
 from beacon_comm.core.parameters import Parameters
@@ -49,6 +50,7 @@ def warm_up(parameters: Parameters, pixels: bool = True) -> None:
         parameters: the receiver's.
         pixels: False: for signals without pixels only, which need neither readers nor detection.
     """
+    save_one_at_a_time()
     events = synthetic_beacon(parameters)
     if not pixels:
         signal_receiver = SignalReceiver(parameters)
