@@ -28,12 +28,18 @@ def expected_index(events, t_from, t_to, offset=10.0, size=SIZE):
 
 
 # Above 1 a subtraction can list a pixel.
-@pytest.mark.parametrize(('threshold', 'offset', 'size'), [(0.6, 10.0, SIZE), (2.0, 1.0, SIZE), (0.6, 10.0, (130, 12))])
+@pytest.mark.parametrize(
+    ('threshold', 'offset', 'size'),
+    [
+        (0.6, 10.0, SIZE), (2.0, 1.0, SIZE), (0.6, 10.0, (130, 12)), (0.6, 10.0, (1, 1)), (0.6, 1.0, (63, 2)),
+        (0.6, 1.0, (64, 1)), (0.6, 1.0, (65, 3)), (0.3, 10.0, (4096, 2)),
+    ],
+)  # fmt: skip
 def test_sliding_windows_equal_counting_from_scratch(threshold, offset, size):
     parameters = Parameters(bit_rates=(200.0, 3125.0), index_threshold=threshold, index_offset=offset)
     images = IndexImages(parameters, size)
     assert [window.hops for window in images.windows] == [2, 11]
-    events = noise(*size, rate_per_s=200_000, duration_s=0.3)
+    events = noise(*size, rate_per_s=min(200_000, 5_000 * size[0] * size[1]), duration_s=0.3)  # no count is full
     for segment in hops(events):
         images.push(gathered(segment, size))
         for window in images.windows:

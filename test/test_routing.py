@@ -25,6 +25,23 @@ def events(n, seed=0, size=SIZE):
     return batch(x, y, rng.choice([-1, 1], n), T0_NS + np.sort(rng.integers(0, HOP_NS, n)))
 
 
+def test_a_hops_events_stay_as_they_were_when_the_next_ones_come():
+    router = Router(Parameters(), SIZE)
+    closed = []
+    for k in range(6):  # the room of the first hops grows, that of the later ones is handed over
+        segment = events(20_000, seed=k)
+        router.aim((), T0_NS)
+        router.route(segment)
+        closed.append((router.close(), segment))
+    assert any(hop.room > len(hop) for hop, _ in closed)
+    for hop, segment in closed:
+        assert len(hop) == len(segment) <= hop.room
+        assert hop.size_bytes >= 8 * hop.room
+        np.testing.assert_array_equal(hop.code & 1, segment.polarity > 0)
+        np.testing.assert_array_equal(hop.code >> 2 & 127, segment.x)
+        np.testing.assert_array_equal(hop.t_start_ns + hop.offset_ns.astype(np.int64), segment.t_ns)
+
+
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32), st.integers(1, 250))
 def test_every_event_goes_to_the_nearest_track_that_holds_it(seed, count):

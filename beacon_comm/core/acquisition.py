@@ -38,7 +38,7 @@ EYE_STEPS = 64
 EYE_SHARE = 0.95
 """The eye is open where it is within this share of its best."""
 
-MOST_CLOSED, LEAST_TOGETHER, BURST_PLACE = 1, 0.5, 0.375
+MOST_CLOSED, LEAST_TOGETHER, BURST_PLACE = 1, 0.5, 1.5 / SUB_SLOTS
 """Where no more phases than the first are closed, the middle of the open ones is anywhere, near the bursts or not: if these are
 together, 0 to 1, by more than the second, bits begin so that they lie at the third (bit), far from the borders of bits and
 sub-slots.  At the right rate they are by 0.9 and more, at others by some 0.1."""

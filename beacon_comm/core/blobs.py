@@ -41,7 +41,7 @@ from beacon_comm.core.components import (
 )  # fmt: skip
 from beacon_comm.core.hop_events import CODE_BITS, HopEvents, PixelGrid
 from beacon_comm.core.index_image import IndexImages, Window, hop_length_ns, pixel_counts
-from beacon_comm.core.nearest import CELL_SHIFT, cells_with_members, events_in, list_cells
+from beacon_comm.core.nearest import CELL_SHIFT, cells_along, cells_with_members, events_in, list_cells
 from beacon_comm.core.parameters import Parameters
 
 FRESH_EVENTS = 4  # fewer new events say nothing about the position …
@@ -117,7 +117,7 @@ class BlobFinder:
         """Return the blobs at the hop that ends at ``t_hop_ns`` (ns)."""
         for components in self._sets:
             paint(components.run, self.owner, 0)
-        self._sets = []
+        self._sets, self.box = [], np.empty((0, 4))
         if images.empty:
             return []
         self._sets = [f.find(window) for f, window in zip(self._finders, images.windows, strict=False)]
@@ -224,7 +224,7 @@ def _observe(window, sums, length, code, offset_ns, grid, factor, margin, hop_ns
         box[b, 2], box[b, 3] = min(sums[b, TOP], y - radius), max(sums[b, BOTTOM], y + radius)
         seen[b, 0], seen[b, 1], seen[b, 3] = x, y, extent
     width, height, shift = grid
-    across, down = ((width - 1) >> CELL_SHIFT) + 1, ((height - 1) >> CELL_SHIFT) + 1
+    across, down = cells_along(width), cells_along(height)
     first, member = list_cells(box, width, height, across, down)
     newest = _sum_newest(code, offset_ns, shift, across, first, member, circle, owner)
     for b in range(len(sums)):

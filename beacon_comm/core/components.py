@@ -20,7 +20,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from beacon_comm.core.hop_events import WORD_SHIFT, PixelGrid
-from beacon_comm.core.index_image import Window, pixel_counts
+from beacon_comm.core.index_image import Window, lowest_bit, pixel_counts
 from beacon_comm.core.parameters import Parameters
 
 # Columns of ComponentSet.sums.
@@ -28,9 +28,6 @@ AREA, SEEDS, COUNT, COUNT_X, COUNT_Y, COUNT_RR, LEFT, RIGHT, TOP, BOTTOM = range
 
 _ALL = np.uint64(0xFFFF_FFFF_FFFF_FFFF)
 _NONE = np.uint64(0)
-_DE_BRUIJN = np.uint64(0x03F7_9D71_B4CB_0A89)
-_PLACES = np.empty(64, np.int64)
-_PLACES[[(1 << k) * int(_DE_BRUIJN) % (1 << 64) >> 58 for k in range(64)]] = np.arange(64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +107,7 @@ def _close(low, side, width, wide, closed):  # type: ignore[no-untyped-def]
     near = np.zeros(height, np.bool_)
     for y in range(height):
         if filled[y]:  # its pixels reach the rows y - before … y + after
-            _widen(low[y, :words], before, after, wide[y])
+            _widen(low[y], before, after, wide[y])
             wide[y, -1] &= last
             near[max(y - before, 0) : y + after + 1] = True
     for y in range(height):
@@ -195,12 +192,6 @@ def _narrow(row, before, after, last, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _lowest_bit(bits):  # type: ignore[no-untyped-def]
-    """Return the place of the lowest set bit of a word that has one: 2ᵏ times a de Bruijn number begins with k's 6 bits."""
-    return _PLACES[((bits & (~bits + np.uint64(1))) * _DE_BRUIJN) >> np.uint64(58)]
-
-
-@njit(cache=True, nogil=True)
 def _find_runs(bits, width, shift):  # type: ignore[no-untyped-def]
     """List the runs of all rows, ``(r, 2)`` int32 as in ComponentSet, and where each row's begin, ``(height + 1,)``."""
     height, words = len(bits), ((width - 1) >> WORD_SHIFT) + 1
@@ -223,15 +214,15 @@ def _find_runs(bits, width, shift):  # type: ignore[no-untyped-def]
             if start >= 0:
                 if word == _ALL:
                     continue
-                place = _lowest_bit(~word)
+                place = lowest_bit(~word)
                 run[n, 0], run[n, 1] = start, at + place
                 n += 1
                 start = -1
                 word &= ~((np.uint64(1) << np.uint64(place)) - np.uint64(1))
             while word:
-                begin = _lowest_bit(word)
+                begin = lowest_bit(word)
                 beyond = ~(word >> np.uint64(begin))  # zeros shifted in: set
-                length = _lowest_bit(beyond) if beyond else 64
+                length = lowest_bit(beyond) if beyond else 64
                 if begin + length >= 64:
                     start = at + begin
                     break

@@ -70,12 +70,13 @@ from beacon_comm.core.motion import (
     variance_at,
 )  # fmt: skip
 from beacon_comm.core.motion_tracks import MotionTrack
-from beacon_comm.core.nearest import CELL_SHIFT, cells_with_members, list_cells
+from beacon_comm.core.nearest import cells_along, cells_with_members, list_cells
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.routing import Router, cell_of
 from beacon_comm.core.tracks import Track
 
 STEPS = 10  # of a hop
+_NO_STEP = np.iinfo(np.int64).min
 UPDATE_EVENTS = 48  # so many events of a track are an observation
 _FEWEST_EVENTS = 4  # at a hop's end so few are one
 _FEWEST_USUAL = 0.5  # less than this share of the usual rate is the background's, or one edge of a light that moves …
@@ -130,7 +131,7 @@ class FollowingRouter(Router):
         self._path = np.zeros((len(followed), 10))
         self._rank = np.array([2 * (not track.quiet) + (track.bit_rate_bps is not None) for track in followed], np.int64)
         self._partner = np.full(len(followed), -1)
-        self._step = np.full(1, -1)
+        self._step = np.full(1, _NO_STEP)
         self._hidden = bool((self._state[:, HIDDEN] > 0).any())
         self._first, self._member = np.empty(0, np.int64), np.empty(0, np.int32)
 
@@ -167,7 +168,7 @@ def _follow(  # type: ignore[no-untyped-def]
     index, owner, code, count,
 ):  # fmt: skip
     """List the events that are of a track, with their tracks; move the tracks on; return how many, and the cells' lists."""
-    across, down = ((width - 1) >> CELL_SHIFT) + 1, ((height - 1) >> CELL_SHIFT) + 1
+    across, down = cells_along(width), cells_along(height)
     step_s = step_ns * 1e-9
     has_path = cells_with_members(first)
     routed = np.int64(0)
@@ -176,7 +177,7 @@ def _follow(  # type: ignore[no-untyped-def]
         now = (t_ns[i] - t_hop_ns) // step_ns
         begin_s = now * step_s
         if now != step[0]:
-            fits = step[0] >= 0
+            fits = step[0] != _NO_STEP
             step[0] = now
             for k in range(len(state)):
                 _lay(state[k], path[k], begin_s, step_s, factor, margin)

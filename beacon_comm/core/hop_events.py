@@ -27,7 +27,7 @@ MAX_WIDTH = 1 << 12
 MAX_HEIGHT = 1 << 16
 WORD_SHIFT = 6  # 64 pixels a word
 HOP_PLANES = 8  # of a hop's counts
-BRANCHLESS = 2  # of them
+_BRANCHLESS = 2  # of them
 GROUP_SHIFT = 2  # four planes of a row lie side by side
 _IN_GROUP = (1 << GROUP_SHIFT) - 1
 _BLOCK = 1024  # events whose places are found together
@@ -85,8 +85,9 @@ class HopEvents:
         offset_ns: time since ``t_start_ns`` (ns), ``(n,)`` uint32.
         rows: the rows that have events, ascending, ``(m,)`` int64.
         first: where each row's planes begin in ``planes``, and the end of all, ``(m + 1,)`` int64.
-        planes: bits of their pixels' counts, uint64; see the module's head.
+        planes: bits of their pixels' counts, ``(k,)`` uint64; see the module's head.
         t_start_ns: the hop's begin (ns, sensor clock).
+        room: events that there is room for where ``code`` and ``offset_ns`` stand.
     """
 
     code: NDArray[np.uint32]
@@ -95,21 +96,22 @@ class HopEvents:
     first: NDArray[np.int64]
     planes: NDArray[np.uint64]
     t_start_ns: int
+    room: int
 
     def __len__(self) -> int:
         return len(self.code)
 
     @property
     def size_bytes(self) -> int:
-        """What its arrays take; nothing without events."""
-        columns = (self.code, self.offset_ns, self.rows, self.first, self.planes)
-        return sum(column.nbytes for column in columns) if len(self) else 0
+        """What it takes; nothing without events."""
+        counts = self.rows.nbytes + self.first.nbytes + self.planes.nbytes
+        return counts + self.room * (self.code.itemsize + self.offset_ns.itemsize) if len(self) else 0
 
 
 def no_events() -> HopEvents:
     """Return a hop without events."""
     none = np.empty(0, np.uint32)
-    return HopEvents(none, none, np.empty(0, np.int64), np.zeros(1, np.int64), np.empty(0, np.uint64), 0)
+    return HopEvents(none, none, np.empty(0, np.int64), np.zeros(1, np.int64), np.empty(0, np.uint64), 0, 0)
 
 
 def empty_planes(grid: PixelGrid, planes: int) -> NDArray[np.uint64]:
@@ -129,7 +131,7 @@ class HopCounts:
         self._shift = grid.shift
         self._planes = empty_planes(grid, HOP_PLANES)
         self._counted = np.zeros(grid.height, np.bool_)  # rows with events
-        self._used = np.full(grid.height, BRANCHLESS)  # planes of a row that may have bits
+        self._used = np.full(grid.height, _BRANCHLESS)  # planes of a row that may have bits
 
     def add(self, code: NDArray[np.uint32]) -> None:
         """Count events, ``(n,)`` uint32; see the module's head."""
@@ -189,7 +191,7 @@ def _find_places(code, shift, words, place, bit):  # type: ignore[no-untyped-def
 @njit(cache=True, nogil=True)
 def _carry_on(images, y, polarity, word, bit):  # type: ignore[no-untyped-def]
     """Carry a bit into the planes behind those; return how many are used.  A count that is full stays so."""
-    for plane in range(BRANCHLESS, HOP_PLANES):
+    for plane in range(_BRANCHLESS, HOP_PLANES):
         held = images[plane >> GROUP_SHIFT, y, plane & _IN_GROUP, polarity, word]
         images[plane >> GROUP_SHIFT, y, plane & _IN_GROUP, polarity, word] = held ^ bit
         if not held & bit:
@@ -206,7 +208,7 @@ def _take(rows, images, used):  # type: ignore[no-untyped-def]
     first = np.zeros(len(rows) + 1, np.int64)
     for k in range(len(rows)):
         n = used[rows[k]]
-        used[rows[k]] = BRANCHLESS
+        used[rows[k]] = _BRANCHLESS
         while n and not _has_bits(planes, plane_at(n - 1, rows[k], height, width), width):
             n -= 1
         first[k + 1] = first[k] + n * width

@@ -49,7 +49,11 @@ from beacon_comm.core.parameters import Parameters
 
 _WORD = 1 << WORD_SHIFT
 _IN_GROUP = (1 << GROUP_SHIFT) - 1
+_DE_BRUIJN = np.uint64(0x03F7_9D71_B4CB_0A89)
+_PLACES = np.empty(64, np.int64)
+_PLACES[[(1 << k) * int(_DE_BRUIJN) % (1 << 64) >> 58 for k in range(64)]] = np.arange(64)
 _ALL, _NONE = np.uint64(0xFFFF_FFFF_FFFF_FFFF), np.uint64(0)
+_FEW_PIXELS = 8  # so many of a word are looked at one by one
 _MOST_EVENTS = 1 << 40  # no window has more
 
 
@@ -62,8 +66,7 @@ class Window:
         planes: bits of the OFF, then of the ON events of every pixel, ``(groups, height, 4, 2, words)`` uint64; see the
             module's head.
         used: how many planes of a row may have bits, ``(height,)`` int64.
-        low: whether a pixel is above the lower threshold, row by row, ``(height, stride / 64)`` uint64, bit x % 64 of
-            word x / 64.
+        low: whether a pixel is above the lower threshold, row by row, ``(height, words)`` uint64, bit x % 64 of word x / 64.
         events: events in the window.
     """
 
@@ -100,7 +103,7 @@ class IndexImages:
         self.overflow_events = 0
 
     def _empty_window(self, hops: int) -> Window:
-        low = np.zeros((self.grid.height, self.grid.stride >> WORD_SHIFT), np.uint64)
+        low = np.zeros((self.grid.height, self.grid.words), np.uint64)
         planes = empty_planes(self.grid, HOP_PLANES + hops.bit_length())
         return Window(hops, planes, np.zeros(self.grid.height, np.int64), low)
 
@@ -183,6 +186,21 @@ def hop_length_ns(parameters: Parameters) -> int:
 
 
 @njit(cache=True, nogil=True)
+def lowest_bit(bits):  # type: ignore[no-untyped-def]
+    """Return the place of the lowest set bit of a word that has one: 2ᵏ times a de Bruijn number begins with k's 6 bits."""
+    return _PLACES[((bits & (~bits + np.uint64(1))) * _DE_BRUIJN) >> np.uint64(58)]
+
+
+@njit(cache=True, nogil=True)
+def _count_bits(bits):  # type: ignore[no-untyped-def]
+    """Return how many bits of a word are set: by twos, fours and bytes, and the bytes summed up by a product."""
+    bits -= (bits >> np.uint64(1)) & np.uint64(0x5555_5555_5555_5555)
+    bits = (bits & np.uint64(0x3333_3333_3333_3333)) + ((bits >> np.uint64(2)) & np.uint64(0x3333_3333_3333_3333))
+    bits = (bits + (bits >> np.uint64(4))) & np.uint64(0x0F0F_0F0F_0F0F_0F0F)
+    return (bits * np.uint64(0x0101_0101_0101_0101)) >> np.uint64(56)
+
+
+@njit(cache=True, nogil=True)
 def pixel_counts(planes, used, y, x):  # type: ignore[no-untyped-def]
     """Return how many OFF and ON events of a pixel a window's ``planes`` hold."""
     word, place = x >> WORD_SHIFT, np.uint64(x & (_WORD - 1))
@@ -201,31 +219,42 @@ def _slide(  # type: ignore[no-untyped-def]
     """Take the counts that leave off and add those that come, row by row; find the low pixels of these rows again."""
     fewest = np.int64(min(max(1.0, np.ceil(low * offset)), float(_MOST_EVENTS)))
     height, words, flat = planes.shape[1], planes.shape[4], planes.reshape(-1)
-    carry, many = np.empty(2 * words, np.uint64), np.empty(words, np.uint64)
+    carry, many, changed = np.empty(2 * words, np.uint64), np.empty(words, np.uint64), np.empty(2 * words, np.uint64)
     counts, is_low = np.empty((2, _WORD), np.int64), np.empty(_WORD, np.uint64)
     i = j = 0
     while i < len(gone_rows) or j < len(came_rows):
         goes = i < len(gone_rows) and (j >= len(came_rows) or gone_rows[i] <= came_rows[j])
         comes = j < len(came_rows) and (i >= len(gone_rows) or came_rows[j] <= gone_rows[i])
         y = came_rows[j] if comes else gone_rows[i]
+        changed[:] = _NONE
         if goes:
-            _change(flat, y, height, gone, gone_first[i], gone_first[i + 1], _ALL, carry)
+            _change(flat, y, height, gone, gone_first[i], gone_first[i + 1], _ALL, carry, changed)
             i += 1
         if comes:
-            changed = _change(flat, y, height, came, came_first[j], came_first[j + 1], _NONE, carry)
-            used[y] = max(used[y], changed)
+            reached = _change(flat, y, height, came, came_first[j], came_first[j + 1], _NONE, carry, changed)
+            used[y] = max(used[y], reached)
             j += 1
         used[y] = _find_many(flat, y, height, used[y], fewest, many, carry)
         for word in range(words):
-            low_bits[y, word] = _NONE
-            if many[word]:
-                _unpack(planes[:, y, :, :, word], used[y], counts)
-                low_bits[y, word] = _find_low(counts, low, offset, is_low)
+            pixels = changed[word] | changed[words + word]
+            if pixels:
+                low_bits[y, word] &= ~pixels
+                pixels &= many[word]
+                if _count_bits(pixels) > _FEW_PIXELS:  # all 64 at once
+                    _unpack(planes[:, y, :, :, word], used[y], counts)
+                    low_bits[y, word] = _find_low(counts, low, offset, is_low)
+                    continue
+                while pixels:
+                    place = lowest_bit(pixels)
+                    off, on = pixel_counts(planes, used, y, (word << WORD_SHIFT) + place)
+                    low_bits[y, word] |= np.uint64(off + on >= low * (offset + abs(on - off))) << np.uint64(place)
+                    pixels &= pixels - np.uint64(1)
 
 
 @njit(cache=True, nogil=True)
-def _change(planes, y, height, by, start, stop, flip, carry):  # type: ignore[no-untyped-def]
-    """Add the counts ``by[start:stop]`` to a row's, or take them off: ``flip`` 0, or all bits; return how many planes changed.
+def _change(planes, y, height, by, start, stop, flip, carry, changed):  # type: ignore[no-untyped-def]
+    """Add the counts ``by[start:stop]`` to a row's, or take them off: ``flip`` 0, or all bits; return how many planes changed,
+    and gather which words.
 
     Both carry alike, but that a difference borrows where the bit that it is taken off is not set.
     """
@@ -238,22 +267,25 @@ def _change(planes, y, height, by, start, stop, flip, carry):  # type: ignore[no
         for k in range(width):
             held, other, more = planes[at + k], by[of + k], carry[k]
             planes[at + k] = held ^ other ^ more
+            changed[k] |= other
             able = held ^ flip
             carry[k] = (able & other) | (more & (able ^ other))
         of += width
         plane += 1
-    while True:
+    most = (len(planes) // (height * len(carry))) - 1  # the last plane, whatever should be carried on
+    while plane <= most:
         some = _NONE
         for k in range(width):
             some |= carry[k]
         if not some:
-            return plane
+            break
         at = plane_at(plane, y, height, len(carry))
         for k in range(width):
             held, more = planes[at + k], carry[k]
             planes[at + k] = held ^ more
             carry[k] = (held ^ flip) & more
         plane += 1
+    return plane
 
 
 @njit(cache=True, nogil=True)

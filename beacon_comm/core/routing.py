@@ -155,12 +155,12 @@ class Router:
     def close(self) -> HopEvents:
         """Return the events gathered in the hop interval, and begin the next one."""
         n, self._gathered = self._gathered, 0
-        code, offset_ns = self._code[:n], self._offset_ns[:n]
+        code, offset_ns, room = self._code[:n], self._offset_ns[:n], len(self._code)
         if n < _HANDED_OVER * len(self._code):
-            code, offset_ns = code.copy(), offset_ns.copy()
+            code, offset_ns, room = code.copy(), offset_ns.copy(), n
         else:
             self._code, self._offset_ns = np.empty_like(self._code), np.empty_like(self._offset_ns)
-        return HopEvents(code, offset_ns, *self._counts.take(), self._t_hop_ns)
+        return HopEvents(code, offset_ns, *self._counts.take(), self._t_hop_ns, room)
 
     def _make_room(self, n: int) -> None:
         room = math.ceil(_MORE_ROOM * (self._gathered + n))
