@@ -259,6 +259,22 @@ def check_another_driver_is_read(peer: Peer, track_id: int, stream: list[bytes])
     assert min(character.track_id for character in characters(peer)[before:]) > track_id
 
 
+def test_a_text_that_grew_while_nobody_listened_is_published_to_who_comes(
+    peer: Peer, start: Callable[..., NodeProcess]
+) -> None:
+    node = start('-r', 'events:=/camera/events', '-p', 'bit_rates:=[3125]')
+    peer.listen('/beacon_node/characters', messages.Characters)
+    node.wait_for('waiting for events on /camera/events')
+    peer.advertise(EventPacket, '/camera/events', ReliabilityPolicy.BEST_EFFORT)
+    assert peer.spin_until(peer.publisher.get_subscription_count), node.output()
+    assert peer.spin_until(lambda: peer.node.count_publishers('/beacon_node/characters'))
+    publish(peer, packets(beacon_events(6 * TEXT, NS_PER_S, 30, 20)))
+    assert peer.spin_until(lambda: characters(peer) and characters(peer)[-1].code == ord('\n'))
+    peer.listen('/beacon_node/text', messages.Text)
+    assert peer.spin_until(lambda: peer.heard['/beacon_node/text'])
+    assert peer.heard['/beacon_node/text'][0].text.endswith(r'day?\n')
+
+
 def test_reasons_of_every_severity_are_logged_and_the_node_goes_on(
     peer: Peer, start: Callable[..., NodeProcess]
 ) -> None:

@@ -54,9 +54,9 @@ from beacon_comm.ros.topic import (
 NODE_NAME = 'beacon_node'
 GRAPH_PERIOD_S = 0.25
 REPORT_PERIOD_S = 1.0
-LONGEST_TURN_S = 0.02
+LONGEST_TURN_S, LONGEST_SIMULATED_TURN_S = 0.02, 0.005
 """Messages are read, and waited for, until it is time to publish, but for no longer before other timers, /clock and the graph's
-news have their turn."""
+news have their turn; where /clock tells the time, that is to come soon."""
 LOG_PERIOD_NS = NS_PER_S
 SILENCE_LOG_PERIOD_NS = 10 * NS_PER_S
 ACKNOWLEDGED_WITHIN = Duration(nanoseconds=NS_PER_S // 5)
@@ -165,7 +165,8 @@ class BeaconNode(Node):
     @guarded
     def _on_message(self, cdr: bytes, info: dict[str, int]) -> None:
         # A turn of the executor takes as long as reading a packet: messages that wait, or come soon, are read in the same one.
-        stop_s = time.monotonic() + min(LONGEST_TURN_S, (self._publish_timer.time_until_next_call() or 0) / NS_PER_S)
+        longest_s = LONGEST_SIMULATED_TURN_S if self.get_clock().ros_time_is_active else LONGEST_TURN_S
+        stop_s = time.monotonic() + min(longest_s, (self._publish_timer.time_until_next_call() or 0) / NS_PER_S)
         self._read(cdr, info)
         while (left_s := stop_s - time.monotonic()) > 0.0 and self._queue is not None:
             if (waiting := self._queue.take(left_s)) is not None:

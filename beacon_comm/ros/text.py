@@ -54,7 +54,9 @@ class Texts:
 
     def add(self, stamped: StampedCharacter) -> None:
         """Append a character to its beacon's text."""
-        text = self._growing.setdefault(stamped.track_id, _Growing(stamped.at))
+        text = self._growing.get(stamped.track_id)
+        if text is None:
+            text = self._growing[stamped.track_id] = _Growing(stamped.at)
         text.at = stamped.at
         text.codes.append(stamped.character.code)
         text.statuses.append(stamped.character.status)
