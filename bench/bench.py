@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))  # PYTHONSAFEPATH leave
 
 from live import Phase, can_publish_arrays, measure  # noqa: E402
 from measuring import ChainRun, MetricTable, best_s, mev_per_s, module_ns, run_chain  # noqa: E402
-from streams import Stream, make_stream, messages, real_words  # noqa: E402
+from streams import DENSE, Stream, make_stream, messages, real_words  # noqa: E402
 
 from beacon_comm.compiling.warm_up import warm_up  # noqa: E402
 from beacon_comm.core.detection import Detector  # noqa: E402
@@ -41,8 +41,6 @@ PROJECT = Path(__file__).resolve().parents[1]
 PACKET_TYPE, ARRAY_TYPE = 'event_camera_msgs/msg/EventPacket', 'dvs_msgs/msg/EventArray'
 HD, VGA = (1280, 720), (640, 480)
 MEGABYTE = 1_000_000
-DENSE = 2.0
-"""index_threshold in a scene of so many events: every pixel has some of both polarities in the long window."""
 
 
 def row(*cells: object) -> None:

@@ -31,7 +31,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))  # PYTHONSAFEPATH leaves it out
 
-from streams import LOOP_NS, START_NS, Stream, make_stream, messages  # noqa: E402
+from streams import DENSE, LOOP_NS, START_NS, Stream, make_stream, messages  # noqa: E402
 
 from beacon_comm.core.events import NS_PER_S  # noqa: E402
 from beacon_comm.wire.cdr import EVENT_STRIDE_BYTES, build_event_packet, parse_event_array, parse_event_packet  # noqa: E402
@@ -192,7 +192,7 @@ class Node:
 
     def __init__(self, folder: Path) -> None:
         self._log = folder / 'node.log'
-        arguments = ['--ros-args', '-r', f'events:={TOPIC}', '-p', 'index_threshold:=2.0']
+        arguments = ['--ros-args', '-r', f'events:={TOPIC}', '-p', f'index_threshold:={DENSE}']
         with self._log.open('w') as log:
             self.process = subprocess.Popen(
                 [sys.executable, '-P', '-m', 'beacon_comm.ros.node', *arguments], stdout=log, stderr=subprocess.STDOUT

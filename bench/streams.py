@@ -37,6 +37,8 @@ LOOP_CHARACTERS = ((291, 3123.8), (47, 503.9))
 BITS = 11
 START_NS = NS_PER_S
 RADIUS_PX = 4.0
+DENSE = 3.0
+"""index_threshold in scenes of so many events that every pixel has some of both polarities in the long window."""
 
 
 @dataclass(frozen=True, slots=True)
