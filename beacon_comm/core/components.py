@@ -103,7 +103,7 @@ def _close(low, side, width, wide, closed):  # type: ignore[no-untyped-def]
     before, after = side // 2, side - 1 - side // 2
     last = _ALL >> np.uint64(-width & 63)  # the pixels of a row's last word
     spread = np.empty(words, np.uint64)
-    filled = _filled_rows(low, words)
+    filled = _filled_rows(low)
     near = np.zeros(height, np.bool_)
     for y in range(height):
         if filled[y]:  # its pixels reach the rows y - before … y + after
@@ -124,7 +124,7 @@ def _close(low, side, width, wide, closed):  # type: ignore[no-untyped-def]
     for y in range(height):
         for k in range(words):
             wide[y, k] = closed[y, k]
-    filled = _filled_rows(closed, words)
+    filled = _filled_rows(closed)
     for y in range(height):
         # It stays where the rows y - before … y + after, as they were, are set.
         if filled[y]:
@@ -134,23 +134,15 @@ def _close(low, side, width, wide, closed):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _filled_rows(bits, words):  # type: ignore[no-untyped-def]
+def _filled_rows(bits):  # type: ignore[no-untyped-def]
     """Return which rows have a set pixel; an array slice a row would take longer than looking."""
     filled = np.empty(len(bits), np.bool_)
     for y in range(len(bits)):
         some = _NONE
-        for k in range(words):
+        for k in range(bits.shape[1]):
             some |= bits[y, k]
         filled[y] = some != _NONE
     return filled
-
-
-@njit(cache=True, nogil=True)
-def _has_any(row):  # type: ignore[no-untyped-def]
-    some = _NONE
-    for k in range(len(row)):
-        some |= row[k]
-    return some != _NONE
 
 
 @njit(cache=True, nogil=True)
@@ -158,45 +150,42 @@ def _widen(row, before, after, out):  # type: ignore[no-untyped-def]
     """Dilate a row: pixel x sets x - before … x + after."""
     for k in range(len(out)):
         out[k] = row[k]
-    if _has_any(row):
-        for step in range(1, before + 1):
-            for k in range(len(out)):
-                out[k] |= row[k] >> np.uint64(step)
-                if k + 1 < len(out):
-                    out[k] |= row[k + 1] << np.uint64(64 - step)
-        for step in range(1, after + 1):
-            for k in range(len(out)):
-                out[k] |= row[k] << np.uint64(step)
-                if k:
-                    out[k] |= row[k - 1] >> np.uint64(64 - step)
+    for step in range(1, before + 1):
+        for k in range(len(out)):
+            out[k] |= row[k] >> np.uint64(step)
+            if k + 1 < len(out):
+                out[k] |= row[k + 1] << np.uint64(64 - step)
+    for step in range(1, after + 1):
+        for k in range(len(out)):
+            out[k] |= row[k] << np.uint64(step)
+            if k:
+                out[k] |= row[k - 1] >> np.uint64(64 - step)
 
 
 @njit(cache=True, nogil=True)
 def _narrow(row, before, after, last, out):  # type: ignore[no-untyped-def]
     """Erode a row, given as a copy: pixel x stays if x - before … x + after are set or beyond the border."""
     end = len(out) - 1
-    some = _has_any(row)
     row[end] |= ~last
     for k in range(len(out)):
-        out[k] = row[k] if some else _NONE
-    if some:
-        for step in range(1, after + 1):
-            for k in range(len(out)):
-                right = row[k + 1] if k < end else _ALL
-                out[k] &= row[k] >> np.uint64(step) | right << np.uint64(64 - step)
-        for step in range(1, before + 1):
-            for k in range(len(out)):
-                left = row[k - 1] if k else _ALL
-                out[k] &= row[k] << np.uint64(step) | left >> np.uint64(64 - step)
-        out[end] &= last
+        out[k] = row[k]
+    for step in range(1, after + 1):
+        for k in range(len(out)):
+            right = row[k + 1] if k < end else _ALL
+            out[k] &= row[k] >> np.uint64(step) | right << np.uint64(64 - step)
+    for step in range(1, before + 1):
+        for k in range(len(out)):
+            left = row[k - 1] if k else _ALL
+            out[k] &= row[k] << np.uint64(step) | left >> np.uint64(64 - step)
+    out[end] &= last
 
 
 @njit(cache=True, nogil=True)
 def _find_runs(bits, width, shift):  # type: ignore[no-untyped-def]
     """List the runs of all rows, ``(r, 2)`` int32 as in ComponentSet, and where each row's begin, ``(height + 1,)``."""
-    height, words = len(bits), ((width - 1) >> WORD_SHIFT) + 1
+    height, words = bits.shape
     row_first = np.zeros(height + 1, np.int64)
-    filled = _filled_rows(bits, words)
+    filled = _filled_rows(bits)
     run = np.empty((1024, 2), np.int32)
     n = 0
     for y in range(height):
