@@ -381,11 +381,8 @@ class MotionTracker(Tracker):
         Of two that are read, or of two that are not, the younger is the double; else the one that is not.
         """
         state = np.array([(*t.position_at(t_hop_ns), t.extent_px, t.quiet) for t in tracks]).reshape(-1, 4)
-        near, some = _near(state)
-        if not some.any():
-            for track in tracks:
-                track.covered_since_ns = None
-            return
+        near = _near(state)
+        some = near.any(axis=1)
         quiet = state[:, 3] > 0.0
         unread = np.array([track.known_bps is None for track in tracks])
         for i, track in enumerate(tracks):
@@ -488,12 +485,12 @@ def _evidence(rows, forget, offset):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _near(state):  # type: ignore[no-untyped-def]
-    """Return of each track which others it may be one light with, ``(n, n)``, and whether there are any, ``(n,)``.
+    """Return of each track which others it may be one light with, ``(n, n)`` bool.
 
     ``state``: x, y, extent, whether it is quiet.
     """
     n = len(state)
-    near, some = np.zeros((n, n), np.bool_), np.zeros(n, np.bool_)
+    near = np.zeros((n, n), np.bool_)
     for i in range(n):
         for j in range(n):
             if i != j:
@@ -501,5 +498,4 @@ def _near(state):  # type: ignore[no-untyped-def]
                 same = distance < _SAME_EXTENTS * min(state[i, 2], state[j, 2])
                 within = distance < state[j, 2] and state[i, 3] > 0.0 and state[j, 3] == 0.0
                 near[i, j] = same or within
-                some[i] |= near[i, j]
-    return near, some
+    return near
