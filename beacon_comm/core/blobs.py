@@ -121,8 +121,6 @@ class BlobFinder:
         if images.empty:
             return []
         self._sets = [f.find(window) for f, window in zip(self._finders, images.windows, strict=False)]
-        if not any(map(len, self._sets)):
-            return []
         standing = self._choose(images.windows)
         window = np.repeat(np.arange(len(standing)), [len(numbers) for numbers in standing])
         if len(window) == 0:

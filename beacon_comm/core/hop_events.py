@@ -29,7 +29,7 @@ WORD_SHIFT = 6  # 64 pixels a word
 HOP_PLANES = 8  # of a hop's counts
 _BRANCHLESS = 2  # of them
 GROUP_SHIFT = 2  # four planes of a row lie side by side
-_IN_GROUP = (1 << GROUP_SHIFT) - 1
+IN_GROUP = (1 << GROUP_SHIFT) - 1
 _BLOCK = 1024  # events whose places are found together
 
 ON, ROUTED = 1, 2
@@ -192,12 +192,12 @@ def _find_places(code, shift, words, place, bit):  # type: ignore[no-untyped-def
 def _carry_on(images, y, polarity, word, bit):  # type: ignore[no-untyped-def]
     """Carry a bit into the planes behind those; return how many are used.  A count that is full stays so."""
     for plane in range(_BRANCHLESS, HOP_PLANES):
-        held = images[plane >> GROUP_SHIFT, y, plane & _IN_GROUP, polarity, word]
-        images[plane >> GROUP_SHIFT, y, plane & _IN_GROUP, polarity, word] = held ^ bit
+        held = images[plane >> GROUP_SHIFT, y, plane & IN_GROUP, polarity, word]
+        images[plane >> GROUP_SHIFT, y, plane & IN_GROUP, polarity, word] = held ^ bit
         if not held & bit:
             return plane + 1
     for plane in range(HOP_PLANES):
-        images[plane >> GROUP_SHIFT, y, plane & _IN_GROUP, polarity, word] |= bit
+        images[plane >> GROUP_SHIFT, y, plane & IN_GROUP, polarity, word] |= bit
     return HOP_PLANES
 
 
@@ -235,4 +235,4 @@ def _has_bits(planes, at, width):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def plane_at(plane, y, height, width):  # type: ignore[no-untyped-def]
     """Return the place of the first of a row's ``width`` words, OFF and ON, of a plane of an image, which is flat."""
-    return np.uint64((((plane >> GROUP_SHIFT) * height + y) << GROUP_SHIFT | plane & _IN_GROUP) * width)
+    return np.uint64((((plane >> GROUP_SHIFT) * height + y) << GROUP_SHIFT | plane & IN_GROUP) * width)

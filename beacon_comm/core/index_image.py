@@ -38,6 +38,7 @@ from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.hop_events import (
     GROUP_SHIFT,
     HOP_PLANES,
+    IN_GROUP,
     WORD_SHIFT,
     HopEvents,
     PixelGrid,
@@ -48,7 +49,6 @@ from beacon_comm.core.hop_events import (
 from beacon_comm.core.parameters import Parameters
 
 _WORD = 1 << WORD_SHIFT
-_IN_GROUP = (1 << GROUP_SHIFT) - 1
 _DE_BRUIJN = np.uint64(0x03F7_9D71_B4CB_0A89)
 _PLACES = np.empty(64, np.int64)
 _PLACES[[(1 << k) * int(_DE_BRUIJN) % (1 << 64) >> 58 for k in range(64)]] = np.arange(64)
@@ -206,7 +206,7 @@ def pixel_counts(planes, used, y, x):  # type: ignore[no-untyped-def]
     word, place = x >> WORD_SHIFT, np.uint64(x & (_WORD - 1))
     off, on = _NONE, _NONE
     for plane in range(used[y]):
-        row = planes[plane >> GROUP_SHIFT, y, plane & _IN_GROUP]
+        row = planes[plane >> GROUP_SHIFT, y, plane & IN_GROUP]
         off |= ((row[0, word] >> place) & np.uint64(1)) << np.uint64(plane)
         on |= ((row[1, word] >> place) & np.uint64(1)) << np.uint64(plane)
     return np.int64(off), np.int64(on)
@@ -326,7 +326,7 @@ def _unpack(planes, used, counts):  # type: ignore[no-untyped-def]
         for k in range(_WORD):
             counts[polarity, k] = 0
         for plane in range(used):
-            bits = planes[plane >> GROUP_SHIFT, plane & _IN_GROUP, polarity]
+            bits = planes[plane >> GROUP_SHIFT, plane & IN_GROUP, polarity]
             for k in range(_WORD):
                 counts[polarity, k] |= np.int64((bits >> np.uint64(k)) & np.uint64(1)) << plane
 
