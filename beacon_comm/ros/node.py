@@ -75,9 +75,9 @@ def _run(args: Sequence[str] | None, stop: StopSignal) -> int:
         node = BeaconNode()
         executor = SingleThreadedExecutor()
         executor.add_node(node)
+        stop.started()
         gc.collect()
         gc.freeze()  # what stays for good, the compiler's above all, need not be gone through again: a tenth of a second
-        stop.started()
         while rclpy.ok() and not stop.requested:
             executor.spin_once()  # the node's timers bound the wait
     except BeaconCommError as error:
