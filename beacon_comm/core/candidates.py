@@ -25,6 +25,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,8 +63,7 @@ class BeaconState(IntEnum):
     """Unseen past lost_after_s, merged, or ended in favour of others where max_tracks are kept."""
 
 
-@dataclass(frozen=True, slots=True)
-class ReceivedCharacter:
+class ReceivedCharacter(NamedTuple):
     """A character and the label of the track it came from."""
 
     track_id: int
@@ -196,8 +196,10 @@ class CandidateSlots:
         for track_id in [track_id for track_id, slot in self._slots.items() if slot.record.demoted]:
             self._end_turn(track_id, t_ns)
         queue = self._queue(tracks)
-        self._end_turns_that_are_over(t_ns, len(queue) - self._free)
-        given = queue[: self._free]
+        given: list[int] = []
+        if queue:
+            self._end_turns_that_are_over(t_ns, len(queue) - self._free)
+            given = queue[: self._free]
         search_load = self._share_search_load(len(given), t_ns)
         self._slots_full = len(queue) > len(given)
         received = []

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 NS_PER_S = 1_000_000_000
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class EventBatch:
-    """Events in order of time, all of one sensor.
+    """Events in order of time, all of one sensor; not to be changed.
 
     Attributes:
         x, y: pixel column and row, ``(n,)`` uint16.

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -31,8 +31,7 @@ _FIRST_ROOM, _MORE_ROOM = 4096, 1.25
 _HANDED_OVER = 0.75  # a room that is filled by this share is handed over as it is, else what is in it
 
 
-@dataclass(frozen=True, slots=True)
-class Routed:
+class Routed(NamedTuple):
     """Events of one track.
 
     Attributes:

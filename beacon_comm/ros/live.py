@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from beacon_comm.core.bearing import CameraModel
 from beacon_comm.core.demodulator import decision_delay_bits
@@ -25,15 +25,14 @@ from beacon_comm.core.receiver import BeaconSnapshot, Output, Receiver
 from beacon_comm.ros.clock_map import ClockMap
 from beacon_comm.ros.stamped import Instant, StampedCharacter
 from beacon_comm.ros.stream_time import StreamTime
-from beacon_comm.wire.stream import Decoded, EventStream
+from beacon_comm.wire.stream import NOTHING, Decoded, EventStream
 
 _HURRIED_SHARE, _HURRIED_NS = 0.1, NS_PER_S
 """What is left of ``search_load`` while messages are shed, and until so much of the stream (ns) has been read without: searches
 that are cut by the next gap begin again, and would keep the node too slow for ever."""
 
 
-@dataclass(frozen=True, slots=True)
-class Step:
+class Step(NamedTuple):
     """What one message, one tick of a silent topic or the end of the stream gave.
 
     Attributes:
@@ -148,12 +147,7 @@ class LiveReceiver:
                     give(self._step(now_ns, batch.t_end_ns))
             self._calm_down(receiver)
             end_ns = batch.t_end_ns
-        return replace(
-            self._step(now_ns, end_ns),
-            problem=decoded.problem,
-            problem_kind=decoded.problem_kind or '',
-            lost_packets=decoded.lost_packets,
-        )
+        return self._step(now_ns, end_ns, decoded)
 
     def shed(self, now_ns: int) -> None:
         """Pass a message over unread: there was no time for it.  What was in it is missing, not silent."""
@@ -277,8 +271,11 @@ class LiveReceiver:
         self._lost += output.lost
         self._confirmed_changed |= output.confirmed_changed
 
-    def _step(self, now_ns: int, end_ns: int | None = None) -> Step:
+    def _step(self, now_ns: int, end_ns: int | None = None, decoded: Decoded = NOTHING) -> Step:
         characters, lost, changed = tuple(self._gathered), tuple(self._lost), self._confirmed_changed
         due_ns = () if end_ns is None else tuple(self._due_ns)  # what a silence or the end decides was held by no message
         self._gathered, self._lost, self._confirmed_changed, self._due_ns = [], [], False, []
-        return Step(self.now(now_ns), characters, lost, changed, end_ns=end_ns, due_ns=due_ns)
+        kind = decoded.problem_kind or ''
+        return Step(
+            self.now(now_ns), characters, lost, changed, decoded.problem, kind, decoded.lost_packets, end_ns, due_ns
+        )

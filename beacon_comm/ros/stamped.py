@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from beacon_comm.core.character import Character
 
 
-@dataclass(frozen=True, slots=True)
-class Instant:
+class Instant(NamedTuple):
     """One instant on both clocks.
 
     Attributes:
@@ -20,8 +19,7 @@ class Instant:
     sensor_ns: int
 
 
-@dataclass(frozen=True, slots=True)
-class StampedCharacter:
+class StampedCharacter(NamedTuple):
     """A character of a track, with the instant of its start edge."""
 
     track_id: int

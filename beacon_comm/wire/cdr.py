@@ -22,7 +22,7 @@ against the bytes that are there.  Payloads are views of the caller's bytes, not
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,8 +45,7 @@ _UINT32 = struct.Struct('<I')
 Bytes = bytes | bytearray | memoryview
 
 
-@dataclass(frozen=True, slots=True)
-class Packet:
+class Packet(NamedTuple):
     """An EventPacket without its encoding undone.
 
     Attributes:
@@ -71,8 +70,7 @@ class Packet:
     payload: NDArray[np.uint8]
 
 
-@dataclass(frozen=True, slots=True)
-class ArrayPacket:
+class ArrayPacket(NamedTuple):
     """An EventArray with its events still as bytes.
 
     Attributes:

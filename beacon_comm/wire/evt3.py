@@ -97,7 +97,8 @@ class Evt3Decoder:
         words = words_of(packet.payload, '<u2', 2)
         columns = EventColumns(_capacity(words))
         link = self._link
-        link[:] = continuity.elapsed_ns // 1000, continuity.seq_fell, 0, 0
+        link[_ELAPSED_US], link[_SEQ_FELL] = continuity.elapsed_ns // 1000, continuity.seq_fell
+        link[_FOLLOWED] = link[_RESTARTED] = 0
         n = _decode(
             words,
             packet.width,

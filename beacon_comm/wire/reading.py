@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +28,7 @@ TALLY_KINDS = (
 Tally = NDArray[np.int64]
 
 
-@dataclass(frozen=True, slots=True)
-class Continuity:
+class Continuity(NamedTuple):
     """How a packet follows the one before it.
 
     Attributes:
@@ -44,8 +42,7 @@ class Continuity:
     seq_fell: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Reading:
+class Reading(NamedTuple):
     """A packet decoded.
 
     Attributes:

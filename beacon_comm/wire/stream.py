@@ -14,8 +14,9 @@ Everything that can be wrong with a message is counted by kind in :attr:`EventSt
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 
@@ -83,8 +84,7 @@ def is_event_array_type(name: str) -> bool:
     return name.endswith('/msg/EventArray') and name not in PACKET_TYPES
 
 
-@dataclass(frozen=True, slots=True)
-class Decoded:
+class Decoded(NamedTuple):
     """What one message gave.
 
     Attributes:
@@ -112,6 +112,9 @@ class Decoded:
     lost_packets: int = 0
     problem: str | None = None
     problem_kind: str | None = None
+
+
+NOTHING = Decoded(None, 0, '', 0, 0)
 
 
 class EventStream:
