@@ -7,6 +7,8 @@ are matched at once; the assignment problem (Kuhn, 1955) is solved for each grou
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
@@ -17,17 +19,20 @@ _NO_PAIR = 1e12
 
 
 def assign(
-    first: NDArray[np.int64], second: NDArray[np.int64], cost: NDArray[np.float64], shape: tuple[int, int]
+    first: NDArray[np.int64], second: NDArray[np.int64], costs_of_all: Callable[[], NDArray[np.float64]], shape: tuple[int, int]
 ) -> list[tuple[int, int]]:
     """Return the pairs ``(i, j)`` of the best assignment.
 
     Args:
         first, second: the pairs that may be, ``(n,)``.
-        cost: of each, -2 log of its likelihood and a constant, from 0 to far below 10¹², ``(n,)``.
+        costs_of_all: returns of each -2 log of its likelihood and a constant, from 0 to far below 10¹², ``(n,)``; called only
+            where some compete.
         shape: how many first and second ones there are.
     """
-    if np.bincount(first).max(initial=0) <= 1 and np.bincount(second).max(initial=0) <= 1:
-        return list(zip(first.tolist(), second.tolist(), strict=True))
+    firsts, seconds = first.tolist(), second.tolist()
+    if len(set(firsts)) == len(set(seconds)) == len(firsts):
+        return list(zip(firsts, seconds, strict=True))
+    cost = costs_of_all()
     ends = np.concatenate((first, second + shape[0]))
     graph = coo_array((np.ones(len(first)), (first, second + shape[0])), shape=(sum(shape), sum(shape)))
     _, group = connected_components(graph, directed=False)

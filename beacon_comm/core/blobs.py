@@ -40,7 +40,7 @@ from beacon_comm.core.components import (
     paint,
 )  # fmt: skip
 from beacon_comm.core.hop_events import CODE_BITS, HopEvents, PixelGrid
-from beacon_comm.core.index_image import IndexImages, Window, hop_length_ns, pixel_counts
+from beacon_comm.core.index_image import IndexImages, Window, hop_length_ns, pixel_counts, window_hops
 from beacon_comm.core.nearest import CELL_SHIFT, cells_along, cells_with_members, events_in, list_cells
 from beacon_comm.core.parameters import Parameters
 
@@ -50,7 +50,7 @@ SPREAD_EVENTS = 30  # fewer events say nothing about the extent
 AS_ACTIVE = 0.5  # share of the events a pixel that makes another pixel "about as active"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Blob:
     """One blob at one hop.
 
@@ -108,6 +108,7 @@ class BlobFinder:
         self._parameters = parameters
         self._grid = PixelGrid(*sensor_size)
         self._hop_ns = hop_length_ns(parameters)
+        self._length = np.array(window_hops(parameters))
         self._finders = [ComponentFinder(parameters, self._grid) for _ in range(2)]
         self._sets: list[ComponentSet] = []
         self.owner = np.zeros(self._grid.numbers, np.int32)
@@ -121,32 +122,28 @@ class BlobFinder:
         if images.empty:
             return []
         self._sets = [f.find(window) for f, window in zip(self._finders, images.windows, strict=False)]
-        standing = self._choose(images.windows)
-        window = np.repeat(np.arange(len(standing)), [len(numbers) for numbers in standing])
+        window, sums, index = self._choose(images.windows)
         if len(window) == 0:
             return []
-        sums = np.concatenate([s.sums[c] for s, c in zip(self._sets, standing, strict=True)])
-        index = np.concatenate([s.index[c] for s, c in zip(self._sets, standing, strict=True)])
         self.box = sums[:, LEFT : BOTTOM + 1].astype(np.float64)
-        length = np.array([w.hops for w in images.windows])
-        return self._observe(window, sums, index, length, images.newest, t_hop_ns)
+        return self._observe(window, sums, index, images.newest, t_hop_ns)
 
-    def _choose(self, windows: list[Window]) -> list[NDArray[np.int64]]:
-        """Return for each window which components stand as blobs, and let them own their pixels."""
+    def _choose(self, windows: list[Window]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+        """Let the components that stand as blobs own their pixels; return of each its window, sums and index."""
         p = self._parameters
         short, long = self._sets[0], self._sets[-1]
-        chosen = _choose(
-            (short.run, short.first, short.sums), (long.run, long.first, long.sums), len(self._sets) > 1,
-            p.min_area_px, p.max_area_px, short.label, windows[0].planes, windows[0].used, self._grid.shift, self.owner,
+        window, sums, index = _choose(
+            (short.run, short.first, short.sums, short.index), (long.run, long.first, long.sums, long.index),
+            len(self._sets) > 1, p.min_area_px, p.max_area_px, short.label, windows[0].planes, windows[0].used,
+            self._grid.shift, self.owner,
         )  # fmt: skip
-        return list(chosen[: len(self._sets)])
+        return window, sums, index
 
     def _observe(
         self,
         window: NDArray[np.int64],
         sums: NDArray[np.int64],
         index: NDArray[np.float64],
-        length: NDArray[np.int64],
         newest: HopEvents,
         t_hop_ns: int,
     ) -> list[Blob]:
@@ -154,19 +151,18 @@ class BlobFinder:
 
         Args:
             window, sums, index: of each, as in :class:`Blob` and :class:`ComponentSet`.
-            length: of each window, in hops.
             newest: the newest hop's events.
             t_hop_ns: its end (ns).
         """
         p = self._parameters
         seen = _observe(
-            window, sums, length, newest.code, newest.offset_ns, (self._grid.width, self._grid.height, self._grid.shift),
+            window, sums, self._length, newest.code, newest.offset_ns, (self._grid.width, self._grid.height, self._grid.shift),
             p.routing_extent_factor, p.routing_margin_px, self._hop_ns, self.owner,
         )  # fmt: skip
         return [
-            Blob(x, y, t_hop_ns - int(ago_ns), extent, i, count, area, int(n), fresh > 0.0, w)
-            for (x, y, ago_ns, extent, n, fresh), i, count, area, w in zip(
-                seen.tolist(), index.tolist(), sums[:, COUNT].tolist(), sums[:, AREA].tolist(), window.tolist(), strict=True
+            Blob(x, y, t_hop_ns - int(ago_ns), extent, i, of[COUNT], of[AREA], int(n), fresh > 0.0, w)
+            for (x, y, ago_ns, extent, n, fresh), i, of, w in zip(
+                seen.tolist(), index.tolist(), sums.tolist(), window.tolist(), strict=True
             )
         ]
 
@@ -175,25 +171,29 @@ class BlobFinder:
 def _choose(  # type: ignore[no-untyped-def]
     short, long, has_long, min_area, max_area, short_label, planes, used, shift, owner
 ):
-    """Compile :meth:`BlobFinder._choose`; ``short``, ``long``: runs, their begins, and sums; ``planes``, ``used``: the short
-    window's."""
-    run, first, sums = short
+    """Compile :meth:`BlobFinder._choose`; ``short``, ``long``: runs, their begins, sums and indices; ``planes``, ``used``: the
+    short window's."""
+    run, first, sums, index = short
     stands, long_stands = _fit(sums, min_area, max_area), np.zeros(0, np.bool_)
     if has_long:
         fits = _fit(long[2], min_area, max_area)
         long_stands = fits & _long_stands(long[0], long[1], fits, short_label, stands, planes, used, shift)
+    count = stands.sum() + long_stands.sum()
+    of, its_sums, its_index = np.empty(count, np.int64), np.empty((count, sums.shape[1]), np.int64), np.empty(count)
     blobs = 0
     for c in range(len(sums)):
         if stands[c]:
+            of[blobs], its_sums[blobs], its_index[blobs] = 0, sums[c], index[c]
             blobs += 1
             paint(run[first[c] : first[c + 1]], owner, blobs)
         elif sums[c, AREA] > max_area:
             paint(run[first[c] : first[c + 1]], owner, -1)
     for c in range(len(long_stands)):
         if long_stands[c]:
+            of[blobs], its_sums[blobs], its_index[blobs] = 1, long[2][c], long[3][c]
             blobs += 1
             paint(long[0][long[1][c] : long[1][c + 1]], owner, blobs)
-    return np.flatnonzero(stands), np.flatnonzero(long_stands)
+    return of, its_sums, its_index
 
 
 @njit(cache=True, nogil=True)

@@ -116,6 +116,7 @@ class FollowingRouter(Router):
         self._state = np.empty((0, motion.WIDTH))
         self._step_ns = max(1, -(-round(parameters.hop_s * NS_PER_S) // STEPS))
         self._hidden = False
+        self._settled = True
         super().__init__(parameters, sensor_size)
 
     def aim(self, tracks: Sequence[Track], t_hop_ns: int) -> None:
@@ -142,6 +143,7 @@ class FollowingRouter(Router):
             self._state, self._path, self._rank, self._partner, self._first, self._member, width, height,
             self._factor, self._margin, self._index, self._owner, code, count,
         )  # fmt: skip
+        self._settled = False
         return int(routed)
 
     def _keep(self, start: int, n: int) -> int:
@@ -153,13 +155,18 @@ class FollowingRouter(Router):
     def close(self) -> HopEvents:
         """Return the events gathered in the hop interval, and begin the next one."""
         _close(self._state, self._partner, self._hop_ns / NS_PER_S)
+        self._settled = False
         self.settle()
         return super().close()
 
     def settle(self) -> None:
         """Tell the tracks what the events since the last hop say about them."""
-        for k in np.flatnonzero(self._state[:, HOP_OFF] + self._state[:, HOP_ON]):
-            self._tracks[int(k)].settle()
+        if self._settled:
+            return
+        self._settled = True
+        for track, events in zip(self._tracks, (self._state[:, HOP_OFF] + self._state[:, HOP_ON]).tolist(), strict=True):
+            if events:
+                track.settle()
 
 
 @njit(cache=True, nogil=True)
@@ -209,32 +216,32 @@ def _follow(  # type: ignore[no-untyped-def]
                     nearest2, best, highest, best_x, best_y = d2, one_of, rank[one_of], dx, dy
             if best < 0:
                 continue
-            row = state[best]
-            code[e] = _HIDDEN if row[HIDDEN] > 0 else code[e] | np.uint32(ROUTED)
+            code[e] = _HIDDEN if state[best, HIDDEN] > 0 else code[e] | np.uint32(ROUTED)
             index[routed] = e
             owner[routed] = best
             count[best] += 1
             routed += 1
             on = np.int64(polarity[e] > 0)
-            row[HOP_OFF + on] += 1.0
-            row[HOP_RR] += nearest2
-            row[LAST] = t_s
+            state[best, HOP_OFF + on] += 1.0
+            state[best, HOP_RR] += nearest2
+            state[best, LAST] = t_s
             other = partner[best]
             fits = True
             if other >= 0:
                 dx = ex - (path[other, _PX] + path[other, _PVX] * dt)
                 dy = ey - (path[other, _PY] + path[other, _PVY] * dt)
-                scale = 2.0 / min(row[EXTENT], state[other, EXTENT]) ** 2  # 1 / 2σ² of a disc, σ = R / 2
+                scale = 2.0 / min(state[best, EXTENT], state[other, EXTENT]) ** 2  # 1 / 2σ² of a disc, σ = R / 2
                 theirs = 1.0 / (1.0 + math.exp(min(scale * (dx * dx + dy * dy - nearest2), 50.0)))
-                _add(state[other], on, theirs, dx, dy, t_s)
-                _add(row, on, 1.0 - theirs, best_x, best_y, t_s)
+                _add(state, other, on, theirs, dx, dy, t_s)
+                _add(state, best, on, 1.0 - theirs, best_x, best_y, t_s)
                 if state[other, N_OFF] + state[other, N_ON] >= UPDATE_EVENTS and _update(state[other], _SHARED, False):
                     _lay(state[other], path[other], begin_s, step_s, factor, margin)
                     fits = _is_in_box(path[other], step_s)
             else:
-                _add(row, on, 1.0, best_x, best_y, t_s)
-            if row[N_OFF] + row[N_ON] >= UPDATE_EVENTS and _update(row, _SHARED if other >= 0 else 1.0, False):
-                _lay(row, path[best], begin_s, step_s, factor, margin)
+                _add(state, best, on, 1.0, best_x, best_y, t_s)
+            many = state[best, N_OFF] + state[best, N_ON] >= UPDATE_EVENTS
+            if many and _update(state[best], _SHARED if other >= 0 else 1.0, False):
+                _lay(state[best], path[best], begin_s, step_s, factor, margin)
                 fits &= _is_in_box(path[best], step_s)
             if not fits:
                 first, member = _list_paths(path, step_s, width, height, across, down)
@@ -308,16 +315,16 @@ def _find_partners(path, rank, state, partner):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _add(row, on, weight, dx, dy, t_s):  # type: ignore[no-untyped-def]
-    """Add an event, or a share of one, to a track's sums."""
-    if row[N_OFF] + row[N_ON] == 0.0:
-        row[SINCE] = t_s
+def _add(state, k, on, weight, dx, dy, t_s):  # type: ignore[no-untyped-def]
+    """Add an event, or a share of one, to the sums of track ``k``."""
+    if state[k, N_OFF] + state[k, N_ON] == 0.0:
+        state[k, SINCE] = t_s
     own = N_OFF + 4 * on
-    row[own] += weight
-    row[own + 1] += weight * dx
-    row[own + 2] += weight * dy
-    row[own + 3] += weight * t_s
-    row[SUM_RR] += weight * (dx * dx + dy * dy)
+    state[k, own] += weight
+    state[k, own + 1] += weight * dx
+    state[k, own + 2] += weight * dy
+    state[k, own + 3] += weight * t_s
+    state[k, SUM_RR] += weight * (dx * dx + dy * dy)
 
 
 @njit(cache=True, nogil=True)

@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -88,8 +88,7 @@ _GRAIN_SPEED_PX_PER_S = 50.0  # at this speed half of that is averaged out: a pi
 _LATENCY_SHARE = 0.25  # of the latency is its standard deviation
 
 
-@dataclass(frozen=True, slots=True)
-class Steady:
+class Steady(NamedTuple):
     """Where a track was when its velocity was last steady: centre (px), velocity (px/s) and radius (px) at a time (ns)."""
 
     x_px: float
@@ -349,7 +348,7 @@ class MotionTracker(Tracker):
         track.extent_px = max(_LEAST_EXTENT_PX, track.extent_px + gain * (extent - track.extent_px))
         track.quiet = False
         track.matched_ns = t_hop_ns
-        speed = float(np.hypot(track.vx_px_per_s, track.vy_px_per_s))
+        speed = math.hypot(track.vx_px_per_s, track.vy_px_per_s)
         old = t_hop_ns - track.first_seen_ns >= _HIDDEN_AFTER_HOPS * hop_ns
         track.row[HIDDEN] = float(seen and old and speed * hop_s > _HIDDEN_SHARE * track.extent_px)
 
@@ -359,11 +358,14 @@ class MotionTracker(Tracker):
         """Return each track's blob and each blob's track, -1 for none: the likeliest assignment within the gates."""
         blob_of, track_of = [-1] * len(tracks), [-1] * len(blobs)
         first, second, distance2 = self._gated(tracks, positions_at(tracks, t_hop_ns), blobs, t_hop_ns)
-        variance = np.array([track.variance_at(t_hop_ns) for track in tracks])
-        seen = np.array([blob.variance_px2 + 1.0 for blob in blobs])
-        both = variance[first] + seen[second]
-        cost = distance2 / both + 2.0 * np.log(both)  # of a normal density: what may be anywhere is hardly just here
-        for i, j in assign(first, second, cost, (len(tracks), len(blobs))):
+
+        def costs() -> NDArray[np.float64]:
+            variance = np.array([track.variance_at(t_hop_ns) for track in tracks])
+            seen = np.array([blob.variance_px2 + 1.0 for blob in blobs])
+            both = variance[first] + seen[second]
+            return distance2 / both + 2.0 * np.log(both)  # of a normal density: what may be anywhere is hardly just here
+
+        for i, j in assign(first, second, costs, (len(tracks), len(blobs))):
             blob_of[i], track_of[j] = j, i
         return blob_of, track_of
 
@@ -382,6 +384,10 @@ class MotionTracker(Tracker):
         """
         state = np.array([(*t.position_at(t_hop_ns), t.extent_px, t.quiet) for t in tracks]).reshape(-1, 4)
         near = _near(state)
+        if not near.any():
+            for track in tracks:
+                track.covered_since_ns = None
+            return
         some = near.any(axis=1)
         quiet = state[:, 3] > 0.0
         unread = np.array([track.known_bps is None for track in tracks])

@@ -230,8 +230,7 @@ class ReferenceBlobFinder(BlobFinder):
         window = np.repeat(np.arange(len(sets)), [len(chosen) for chosen in standing])
         sums = np.concatenate([s.sums[c] for s, c in zip(sets, standing, strict=True)])
         index = np.concatenate([s.index[c] for s, c in zip(sets, standing, strict=True)])
-        length = np.array([w.hops for w in images.windows])
-        return self._observe(window, sums, index, length, images.newest, t_hop_ns)
+        return self._observe(window, sums, index, images.newest, t_hop_ns)
 
     def _let_stand(
         self, sets: list[ReferenceComponents], stands: list[NDArray[np.bool_]], short_n: NDArray[np.int64]
@@ -253,11 +252,10 @@ class ReferenceBlobFinder(BlobFinder):
         window: NDArray[np.int64],
         sums: NDArray[np.int64],
         index: NDArray[np.float64],
-        length: NDArray[np.int64],
         newest: ReferenceEvents,
         t_hop_ns: int,
     ) -> list[Blob]:
-        length = length[window]
+        length = self._length[window]
         x, y, extent = _centre_and_extent(*(sums[:, k] for k in (COUNT, COUNT_X, COUNT_Y, COUNT_RR)))
         n, sum_x, sum_y, sum_rr, sum_t = self._sum_newest(x, y, extent, newest).T
         new_x, new_y, spread = _centre_and_extent(np.maximum(n, 1), sum_x, sum_y, sum_rr)
