@@ -33,6 +33,12 @@ def test_what_reading_takes_is_part_of_the_lag() -> None:
     assert [shedder.sheds(wait * MS) for wait in (6, 5)] == [True, False]
 
 
+def test_who_has_waited_for_long_is_in_a_hurry_before_anything_is_shed() -> None:
+    shedder = Shedder(MAX_LAG_NS)
+    assert [shedder.hurries(wait * MS) for wait in (-5, 0, 15, 16, 49)] == [False, False, False, True, True]
+    assert not shedder.sheds(16 * MS)
+
+
 class Queue:
     """The node's queue and its one thread: a packet every ``PACKET_NS``, reading one takes a given time."""
 
@@ -107,13 +113,17 @@ def test_the_report_tells_of_what_was_shed() -> None:
     assert values['shed_packets'] == 1 and values['lag_s'] == '0.0120'
 
 
-def test_while_messages_are_shed_less_is_spent_on_searching_and_as_much_as_before_a_second_later() -> None:
+@pytest.mark.parametrize('late', ['shed', 'hurry'])
+def test_who_is_late_searches_less_and_as_much_as_before_a_second_later(late: str) -> None:
     session = Session(bit_rates=(504.0, BIT_RATE))
     stream = packets(beacon_events(5 * TEXT))
     session.push(stream[:20])
     slots = session.live._receiver._slots  # type: ignore[union-attr]
     assert slots.search_share == 1.0
-    session.live.shed(session.now_ns)
+    if late == 'shed':
+        session.live.shed(session.now_ns)
+    else:
+        session.live.hurry()
     session.push(stream[21:100])
     assert slots.search_share == 0.1
     session.push(stream[100:250])

@@ -17,6 +17,7 @@ The LED may also be on for 0: the frame is looked for in the bits and in their c
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -235,6 +236,20 @@ class Lock:
     positions: NDArray[np.int32]
 
 
+Look = Generator[None, None, Lock | None]
+"""A look at a window, piece by piece, each a millisecond's work or so; it returns the lock."""
+
+
+def finish(look: Look) -> Lock | None:
+    """Do what is left of a look, and return its lock."""
+    while True:
+        try:
+            next(look)
+        except StopIteration as end:
+            lock: Lock | None = end.value
+            return lock
+
+
 def acquire(
     t: NDArray[np.float64],
     polarity: NDArray[np.int8],
@@ -242,7 +257,18 @@ def acquire(
     layout: NDArray[np.void],
     demands: Demands,
 ) -> Lock | None:
-    """Look for a beacon in a window of events.
+    """Look for a beacon in a window of events, all at once; see :func:`acquiring`."""
+    return finish(acquiring(t, polarity, periods, layout, demands))
+
+
+def acquiring(
+    t: NDArray[np.float64],
+    polarity: NDArray[np.int8],
+    periods: NDArray[np.float64],
+    layout: NDArray[np.void],
+    demands: Demands,
+) -> Look:
+    """Look for a beacon in a window of events, piece by piece.
 
     Args:
         t: event times (ns from an origin), ``(n,)`` float64, non-decreasing.
@@ -256,6 +282,7 @@ def acquire(
     start, stop = t[0], t[-1]
     nearest, farthest = (1.0 - demands.most_stray) * periods.min(), (1.0 + demands.most_stray) * periods.max()
     eyes = _eyes(t, polarity, start, periods, stop)
+    yield
     found: Lock | None = None
     read: list[float] = []
     for _ in range(demands.tried):
@@ -267,10 +294,10 @@ def acquire(
         if any(abs(period - other) * (stop - start) < SAME_BITS * period * other for other in read):
             continue
         read.append(period)
-        lock = _read(t, polarity, start, stop, period, layout, demands.needed)
+        lock = yield from _read(t, polarity, start, stop, period, layout, demands.needed)
         if lock is not None and abs(lock.verdict.slope) > LEAST_SLOPE:
             period = _settled(t, polarity, start, lock.period * (1.0 + lock.verdict.slope))
-            other = _read(t, polarity, start, stop, period, layout, demands.needed)
+            other = yield from _read(t, polarity, start, stop, period, layout, demands.needed)
             if other is not None and other.verdict.spread < lock.verdict.spread:
                 lock = other
         if lock is None or not nearest <= lock.period <= farthest:
@@ -288,7 +315,7 @@ def _read(
     period: float,
     layout: NDArray[np.void],
     needed: int,
-) -> Lock | None:
+) -> Look:
     length = int(layout['length'][0])
     border = start + (_phase(_fine(t, polarity, start, period, stop)) - 1.0) * period
     bits = int((stop - border) / period) + 1
@@ -296,12 +323,14 @@ def _read(
     gain = max(1.0, raw.sum() / bits / REFERENCE_EVENTS)
     counts = COMPRESSION[np.minimum((raw / gain + 0.5).astype(np.int64), len(COMPRESSION) - 1)]
     likelihoods, free = _learn_free(raw, counts)
+    yield
     inverted, path, likelihood = False, None, -np.inf
     for turned in (False, True):
         if _may_convince(free ^ turned, layout):
             other, its_likelihood = framed_path(layout, likelihoods[:, ::-1].copy() if turned else likelihoods)
             if its_likelihood > likelihood:
                 inverted, path, likelihood = turned, other, its_likelihood
+            yield
     if path is None:
         return None
     cost = _log_likelihood(likelihoods, free) - likelihood
@@ -311,6 +340,7 @@ def _read(
     if not hopeful and (passing + failing < needed or cost > CHEAP_COST * (passing + failing)):
         return None  # to learn from the path would cost as much again
     histograms, likelihoods, path = _learn_framed(counts, path, layout, inverted)
+    yield
     passing, failing, changes = _judge(path, free, length)
     covered = passing * length
     framed = np.flatnonzero(path // PLACE < length)

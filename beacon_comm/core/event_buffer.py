@@ -1,7 +1,7 @@
 """Events in order of time that come at the end and go at the beginning; and those of one track's last ``buffer_s``.
 
     times     [ free | live events ……………………… | room ]
-    polarity  [ free | live events ……………………… | room ]       one array each, moved down or doubled when full
+    polarity  [ free | live events ……………………… | room ]       one array each, moved to another one when full
 
 In a track's buffer, what is too old or too much is decided at hops alone and by event time, so that any batching
 leaves the same events.
@@ -23,7 +23,7 @@ _FIRST_ROOM = 256
 
 
 class EventArrays:
-    """Times and polarities of events.
+    """Times and polarities of events.  Views of them stay as they are, whatever comes or goes.
 
     Args:
         time_type: of the times.
@@ -40,12 +40,12 @@ class EventArrays:
 
     @property
     def times(self) -> NDArray[Any]:
-        """View of the times, ``(n,)``; good until events are appended."""
+        """View of the times, ``(n,)``."""
         return self._times[self._start : self._stop]
 
     @property
     def polarity(self) -> NDArray[np.int8]:
-        """View of the polarities, ``(n,)`` of ±1; good until events are appended."""
+        """View of the polarities, ``(n,)`` of ±1."""
         return self._polarity[self._start : self._stop]
 
     def append(self, times: NDArray[Any], polarity: NDArray[np.int8]) -> None:
@@ -63,9 +63,8 @@ class EventArrays:
 
     def _make_room(self, n: int) -> None:
         times, polarity, kept = self.times, self.polarity, len(self)
-        if 2 * (kept + n) > len(self._times):
-            room = 2 * (kept + n)
-            self._times, self._polarity = np.empty(room, times.dtype), np.empty(room, np.int8)
+        room = max(2 * (kept + n), _FIRST_ROOM)
+        self._times, self._polarity = np.empty(room, times.dtype), np.empty(room, np.int8)
         self._times[:kept] = times
         self._polarity[:kept] = polarity
         self._start, self._stop = 0, kept
@@ -101,9 +100,9 @@ class EventBuffer(EventArrays):
         return excess
 
     def events(self) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
-        """Return copies of the times (ns), ``(n,)`` int64, and polarities, ``(n,)`` int8 of ±1."""
+        """Return views of the times (ns), ``(n,)`` int64, and polarities, ``(n,)`` int8 of ±1."""
         self._drop_old()
-        return self.times.copy(), self.polarity.copy()
+        return self.times, self.polarity
 
     def _drop_old(self) -> None:
         times = self.times

@@ -92,6 +92,7 @@ class RateSearch:
     Attributes:
         period: nominal period of a bit, or the longest of several (ns).
         demands: what a lock has to show.
+        made: attempts so far.
         longest: events so far back may still be needed (ns).
         wanted: when the next attempt was to be made, had it not been postponed (ns).
     """
@@ -117,7 +118,7 @@ class RateSearch:
 
     def restart(self, t: float) -> None:
         """Begin anew with a first event at ``t``."""
-        self._made = 0
+        self.made = 0
         self._since = t
         self._at = self._attempts[0]
         self.wanted = self.due
@@ -130,7 +131,7 @@ class RateSearch:
     @property
     def exhausted(self) -> bool:
         """Whether it has looked long enough."""
-        return self._at > EXHAUSTED_AT and self._made >= LEAST_LOOKS
+        return self._at > EXHAUSTED_AT and self.made >= LEAST_LOOKS
 
     def had_a_chance(self, now: float) -> bool:
         """Whether it has seen enough by ``now`` (ns) to find a beacon."""
@@ -147,8 +148,8 @@ class RateSearch:
         short = max(SHORT_WINDOW, self._attempts[0])
         characters = self._at
         if characters > short:
-            longest = LONGEST_WINDOW if self._made >= len(self._attempts) and self._made % 4 == 0 else LONG_WINDOW
-            characters = short if self._made % 2 else min(characters, longest)
+            longest = LONGEST_WINDOW if self.made >= len(self._attempts) and self.made % 4 == 0 else LONG_WINDOW
+            characters = short if self.made % 2 else min(characters, longest)
         begin = max(first, int(np.searchsorted(t, now - characters * self._character)))
         if begin >= stop or t[stop - 1] < now - SHORT_WINDOW * self._character:
             return None
@@ -169,10 +170,10 @@ class RateSearch:
 
     def failed(self) -> None:
         """Go on to the next attempt."""
-        self._made += 1
-        if self._made < len(self._attempts):
-            apart = self._attempts[self._made] - self._attempts[self._made - 1]
-            self._at = max(self._attempts[self._made], self._at + min(1.0, apart))
+        self.made += 1
+        if self.made < len(self._attempts):
+            apart = self._attempts[self.made] - self._attempts[self.made - 1]
+            self._at = max(self._attempts[self.made], self._at + min(1.0, apart))
         else:
             self._at += min(max(LATER_STEP, self._at * self._later_share), self._most_step)
         self.wanted = self.due

@@ -2,7 +2,7 @@
 
 ::
 
-    searching   events ─► buffer ─► attempts on a grid of event time: rate, phase, histograms ─┐
+    searching   events ─► buffer ─► looks at times of the stream: rate, phase, histograms ─────┐
                             ▲                                                                   │ a lock
                             └────────── too many words in doubt ────────┐                       ▼
     locked      events ─► bit clock ─► counts ─► free and framed trellis ─► words ─► characters
@@ -25,8 +25,7 @@ from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.likelihood import MEMORY_BITS
 from beacon_comm.core.parameters import Parameters
-from beacon_comm.core.rate_search import RateSearch, make_searches
-from beacon_comm.core.search_budget import SearchBudget
+from beacon_comm.core.searcher import Found, RateSearcher
 from beacon_comm.core.sequence_detection import (
     BORDER_OF_START,
     FIRST_RATIO,
@@ -83,9 +82,8 @@ class SequenceDemodulator:
         self._frame = CharacterFrame.from_parameters(parameters)
         self._layout = frame_layout(self._frame)
         self._decode = self._frame.decoding_table()
-        self._searches: list[RateSearch] = make_searches(parameters, self._frame)
-        self._longest = max(search.longest for search in self._searches)
         self._most_events = parameters.buffer_max_bytes // EVENT_BYTES
+        self._searcher = RateSearcher(parameters, self._most_events)
         self._rows = np.zeros((_ROWS, FIRST_RATIO + self._frame.length))
         self._lock: Lock | None = None
         self._ended: Lock | None = None  # the lock at the stream's end
@@ -103,8 +101,6 @@ class SequenceDemodulator:
         self._usable_from = -math.inf  # events before this are not read again
         self._found_at = -math.inf  # when the lock was found
         self._searched_to_ns: int | None = None  # by the demodulator before this one
-        kinds = {type(search) for search in self._searches}
-        self._budgets = {kind: SearchBudget(parameters.search_load / len(kinds)) for kind in kinds}
         self._shared: tuple[float, int] | None = None  # load, from when on (ns), before the first event
 
     @property
@@ -141,7 +137,7 @@ class SequenceDemodulator:
     @property
     def given_up(self) -> bool:
         """Whether every rate has been looked for long enough in vain."""
-        return self._lock is None and all(search.exhausted for search in self._searches)
+        return self._lock is None and self._searcher.exhausted
 
     def push(self, t_ns: NDArray[np.int64], polarity: NDArray[np.int8], t_end_ns: int) -> list[Character]:
         """Take the next events; see :class:`beacon_comm.core.demodulator.Demodulator`."""
@@ -151,25 +147,27 @@ class SequenceDemodulator:
             self._origin_ns = int(t_ns[0])
             if self._shared is not None:
                 self.share(*self._shared)
-            self._restart(0.0 if self._searched_to_ns is None else max(0.0, float(self._searched_to_ns - self._origin_ns)))
+            to_ns = self._origin_ns if self._searched_to_ns is None else self._searched_to_ns
+            self._searcher.restart(max(0.0, float(to_ns - self._origin_ns)))
         self._ended = None
         self._events.append(t_ns - self._origin_ns, polarity)
         t_end = float(t_end_ns - self._origin_ns)
         if len(t_ns):
-            for search in self._searches:
-                if search.due == math.inf:  # it met a silence
-                    search.restart(float(t_ns[0] - self._origin_ns))
+            self._searcher.wake(float(t_ns[0] - self._origin_ns))
         characters: list[Character] = []
         while True:
             if self._lock is not None:
-                status, found = self._follow(self._lock, t_end)
-                characters += found
+                status, read = self._follow(self._lock, t_end)
+                characters += read
                 if status in (LOST, LOST_IN_GAP):
                     self._unlock(reread=status == LOST)
                 elif status != FULL:
                     break
-            elif not self._attempt(t_end):
-                break
+            else:
+                found = self._searcher.search(self._t, self._polarity, self._usable_from, t_end)
+                if found is None:
+                    break
+                self._start(found)
         if len(self._events) > min(self._forget_at, self._most_events) or len(self._gaps) > _MANY_GAPS:
             self._forget(t_end)
             self._forget_at = max(2 * len(self._events), _FEW_EVENTS)
@@ -181,8 +179,7 @@ class SequenceDemodulator:
         if self._origin_ns is None:
             self._shared = load, t_ns
             return
-        for budget in self._budgets.values():
-            budget.set_load(load / len(self._budgets), float(t_ns - self._origin_ns))
+        self._searcher.share(load, float(t_ns - self._origin_ns))
 
     def searched(self, to_ns: int) -> None:
         """Hear of searched events; see :class:`beacon_comm.core.demodulator.Searching`."""
@@ -193,20 +190,19 @@ class SequenceDemodulator:
         if self._origin_ns is not None:
             gap = np.array([[start_ns - self._origin_ns, stop_ns - self._origin_ns]], np.float64)
             self._gaps = np.concatenate((self._gaps, gap))
-            for search in self._searches:
-                search.miss(*gap[0].tolist())
+            self._searcher.miss(*gap[0].tolist())
 
     def flush(self) -> list[Character]:
         """End the stream; see :class:`beacon_comm.core.demodulator.Demodulator`."""
         characters: list[Character] = []
         while True:
             if self._lock is None and len(self._t):
-                self._attempt_all()
+                self._search_the_last()
             lock = self._lock
             if lock is None:
                 return characters
-            status, found = self._follow(lock, self._known_to)
-            characters += found
+            status, read = self._follow(lock, self._known_to)
+            characters += read
             if status == STILL_LOCKED:
                 break
             if status != FULL:
@@ -269,11 +265,7 @@ class SequenceDemodulator:
         self._lock = None
         self._refine_at = math.inf
         self._taken = 0
-        self._restart(max(lost_at, self._found_at))
-
-    def _restart(self, t: float) -> None:
-        for search in self._searches:
-            search.restart(t)
+        self._searcher.restart(max(lost_at, self._found_at))
 
     def _characters(self, rows: NDArray[np.float64]) -> list[Character]:
         characters = []
@@ -314,82 +306,23 @@ class SequenceDemodulator:
             edge_spread=row[SPREAD_THEN],
         )
 
-    # Searching
+    # Found
 
-    def _attempt(self, t_end: float) -> bool:
-        """Make the attempt that is due next, if its time has come; return whether one was made."""
-        search = min(self._searches, key=lambda search: (search.due, search.wanted))
-        now = search.due
-        if not now <= t_end:
-            return False
-        budget = self._budgets[type(search)]
-        ready = budget.ready_at(now)
-        if ready > now + 1.0:  # ns, beyond rounding
-            search.postpone(ready)
-            return True
-        stop = int(np.searchsorted(self._t, now))
-        first = max(int(np.searchsorted(self._t, self._usable_from)), stop - self._most_events)
-        window = search.window(self._t, now, first, stop)
-        if window is None:  # nothing there: wait for the next event
-            search.restart(float(self._t[stop]) if stop < len(self._t) else math.inf)
-            return True
-        budget.spend((now - float(self._t[window.start])) / search.period, window.stop - window.start)
-        lock = self._choose(search, now, first, stop, self._look(search, window))
-        search.failed()
-        if lock is not None:
-            self._start(lock, first, now)
-        return True
-
-    def _attempt_all(self) -> None:
-        """Make a last attempt at every rate: the stream ends, and a short message may still wait for the slower ones."""
-        stop = len(self._t)
-        usable_from = max(self._usable_from, self._known_to - self._longest)
-        first = max(int(np.searchsorted(self._t, usable_from)), stop - self._most_events)
-        locks = []
-        for search in self._searches:
-            window = search.window(self._t, float(self._t[-1]), first, stop)
-            lock = None if window is None else self._look(search, window)
-            if lock is not None:
-                locks.append(lock)
-        if locks:
-            self._start(max(locks, key=lambda lock: lock.verdict.merit), first, float(self._t[-1]))
+    def _search_the_last(self) -> None:
+        """Search what the stream's end has left."""
+        t, polarity = self._t, self._polarity
+        found = self._searcher.finish(t, self._usable_from)
+        if found is not None:
+            self._start(found)
+            return
+        found = self._searcher.look_at_all(t, polarity, self._usable_from, self._known_to)
+        if found is not None:
+            self._start(found)
             self._refine_at = math.inf
 
-    def _look(self, search: RateSearch, window: slice) -> Lock | None:
-        t, polarity = self._t[window], self._polarity[window]
-        for periods in search.periods(t, polarity):
-            lock = self._acquire(window, periods, search)
-            if lock is not None:
-                return lock
-        return None
-
-    def _acquire(self, window: slice, periods: NDArray[np.float64], search: RateSearch) -> Lock | None:
-        return acquire(
-            self._t[window],
-            self._polarity[window],
-            periods,
-            self._layout,
-            search.demands,
-        )
-
-    def _choose(self, found: RateSearch, now: float, first: int, stop: int, lock: Lock | None) -> Lock | None:
-        """Return the lock to follow.
-
-        A fast rate finds short frames in one character of a slow signal, with idle line between them: where the words
-        leave much of the time unexplained, the slower searches are asked first.
-        """
-        # That a rate is listed says enough: blind searches are not asked about it.
-        slower = [s for s in self._searches if s.period > found.period and isinstance(s, type(found))]
-        if lock is None or not slower or lock.verdict.full:
-            return lock
-        if not all(search.had_a_chance(now) for search in slower):
-            return None
-        windows = [search.window(self._t, now, first, stop) for search in slower]
-        others = [self._look(search, w) for search, w in zip(slower, windows, strict=True) if w is not None]
-        return max([lock, *(other for other in others if other is not None)], key=lambda lock: lock.verdict.merit)
-
-    def _start(self, lock: Lock, first: int, now: float) -> None:
-        """Follow a lock that was found at the time ``now`` (ns) from the buffer's beginning on."""
+    def _start(self, found: Found) -> None:
+        """Follow a lock from the buffer's beginning on."""
+        lock, now = found.lock, found.now
         border = float(lock.clock['border'][0])
         self._trusted = False
         self._pending = None
@@ -398,9 +331,9 @@ class SequenceDemodulator:
         self._refine_at = border + REFINED_AFTER * self._frame.length * lock.period
         if len(lock.positions) > (REFINED_AFTER - 5) * self._frame.length:
             self._refine_at = math.inf
-        kept = min(self._longest, READ_BACK_CHARACTERS * self._frame.length * lock.period)
+        kept = min(self._searcher.longest, READ_BACK_CHARACTERS * self._frame.length * lock.period)
         # From an event on, as what lies before may be gone from the buffer already.
-        self._begin(lock, float(self._t[max(first, int(np.searchsorted(self._t, now - kept)))]))
+        self._begin(lock, float(self._t[max(found.first, int(np.searchsorted(self._t, now - kept)))]))
 
     def _begin(self, lock: Lock, t: float) -> None:
         """Follow a lock from about the time ``t`` (ns) on."""
@@ -431,7 +364,7 @@ class SequenceDemodulator:
             too_much = len(self._t) - self._most_events
             first = min(self._taken, max(int(np.searchsorted(self._t, needed_from)), too_much))
         else:
-            needed_from = t_end - self._longest
+            needed_from = self._searcher.needed_from(t_end)
             first = max(int(np.searchsorted(self._t, needed_from)), len(self._t) - self._most_events)
         if len(self._gaps):
             if self._lock is not None:  # how the next event is taken depends on whether the silence was one

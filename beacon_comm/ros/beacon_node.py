@@ -181,6 +181,8 @@ class BeaconNode(Node):
             self._live.shed(self._now_ns())
             self.report.shed()
             return
+        if self._shedder.hurries(waited_ns):
+            self._live.hurry()
         step = self._live.push(cdr, self._now_ns(), lambda early: self._give(early, arrival_ns))
         self.report.message(step, waited_ns / NS_PER_S)
         if step.lost_packets:

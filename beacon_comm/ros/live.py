@@ -28,8 +28,8 @@ from beacon_comm.ros.stream_time import StreamTime
 from beacon_comm.wire.stream import NOTHING, Decoded, EventStream
 
 _HURRIED_SHARE, _HURRIED_NS = 0.1, NS_PER_S
-"""What is left of ``search_load`` while messages are shed, and until so much of the stream (ns) has been read without: searches
-that are cut by the next gap begin again, and would keep the node too slow for ever."""
+"""What is left of ``search_load`` while messages wait for long or are shed, and until so much of the stream (ns) has been read
+without: searches that are cut by the next gap begin again, and would keep the node too slow for ever."""
 
 
 class Step(NamedTuple):
@@ -77,7 +77,7 @@ class LiveReceiver:
         self._past_counts: Counter[str] = Counter()
         self._receiver: Receiver | None = None
         self._time = StreamTime(silent_after_ns, lag_ns)
-        self._shed_ns: int | None = None  # the stream's time when messages were shed
+        self._hurried_ns: int | None = None  # the stream's time when there was too little
         self._clock_map = ClockMap()
         self._gathered: list[StampedCharacter] = []
         self._due_ns: list[int] = []
@@ -154,8 +154,12 @@ class LiveReceiver:
         if self._stream is not None:
             self._stream.shed()
         self._time.hear(now_ns)
+        self.hurry()
+
+    def hurry(self) -> None:
+        """Search less for bit rates for a while: there is too little time."""
         if self._receiver is not None and self._receiver.t_ns is not None:
-            self._shed_ns = self._receiver.t_ns
+            self._hurried_ns = self._receiver.t_ns
             self._receiver.search_less(_HURRIED_SHARE)
 
     def messages_lost(self) -> None:
@@ -227,9 +231,11 @@ class LiveReceiver:
         return self._receiver
 
     def _calm_down(self, receiver: Receiver) -> None:
-        """Search for bit rates as before once no message has been shed for a while."""
-        if self._shed_ns is not None and receiver.t_ns is not None and not 0 <= receiver.t_ns - self._shed_ns < _HURRIED_NS:
-            self._shed_ns = None
+        """Search for bit rates as before once there has been time enough for a while."""
+        if self._hurried_ns is None or receiver.t_ns is None:
+            return
+        if not 0 <= receiver.t_ns - self._hurried_ns < _HURRIED_NS:
+            self._hurried_ns = None
             receiver.search_less(1.0)
 
     def _fit_camera(self) -> None:

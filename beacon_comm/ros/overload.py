@@ -21,6 +21,8 @@ from __future__ import annotations
 
 RESUMED = 0.1
 """Share of the longest lag; at such a wait messages are read again."""
+HURRIED = 0.3
+"""Share of the longest lag; who has waited longer is in a hurry: what can wait is to wait."""
 FORGOTTEN = 0.99
 """What is left, one message later, of the longest time that reading one took."""
 
@@ -40,6 +42,10 @@ class Shedder:
     def read(self, took_ns: int) -> None:
         """Learn how long reading a message took (ns)."""
         self._longest_ns = max(float(took_ns), FORGOTTEN * self._longest_ns)
+
+    def hurries(self, waited_ns: int) -> bool:
+        """Tell whether a message that has waited so long (ns) is in a hurry."""
+        return waited_ns > HURRIED * self._max_lag_ns
 
     def sheds(self, waited_ns: int) -> bool:
         """Tell whether to shed a message that has waited so long (ns)."""
