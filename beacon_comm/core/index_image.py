@@ -235,20 +235,25 @@ def _slide(  # type: ignore[no-untyped-def]
             used[y] = max(used[y], reached)
             j += 1
         used[y] = _find_many(flat, y, height, used[y], fewest, many, carry)
+        some = _NONE
+        for word in range(np.uint64(words)):
+            pixels = changed[word] | changed[np.uint64(words) + word]
+            low_bits[y, word] &= ~pixels
+            many[word] &= pixels
+            some |= many[word]
+        if not some:
+            continue
         for word in range(words):
-            pixels = changed[word] | changed[words + word]
-            if pixels:
-                low_bits[y, word] &= ~pixels
-                pixels &= many[word]
-                if _count_bits(pixels) > _FEW_PIXELS:  # all 64 at once
-                    _unpack(planes[:, y, :, :, word], used[y], counts)
-                    low_bits[y, word] = _find_low(counts, low, offset, is_low)
-                    continue
-                while pixels:
-                    place = lowest_bit(pixels)
-                    off, on = pixel_counts(planes, used, y, (word << WORD_SHIFT) + place)
-                    low_bits[y, word] |= np.uint64(off + on >= low * (offset + abs(on - off))) << np.uint64(place)
-                    pixels &= pixels - np.uint64(1)
+            pixels = many[word]
+            if pixels and _count_bits(pixels) > _FEW_PIXELS:  # all 64 at once
+                _unpack(planes[:, y, :, :, word], used[y], counts)
+                low_bits[y, word] = _find_low(counts, low, offset, is_low)
+                continue
+            while pixels:
+                place = lowest_bit(pixels)
+                off, on = pixel_counts(planes, used, y, (word << WORD_SHIFT) + place)
+                low_bits[y, word] |= np.uint64(off + on >= low * (offset + abs(on - off))) << np.uint64(place)
+                pixels &= pixels - np.uint64(1)
 
 
 @njit(cache=True, nogil=True)
