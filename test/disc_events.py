@@ -100,8 +100,8 @@ def detect(
     """Feed events hop by hop; return what was routed to each track."""
     routed: dict[int, list[Routed]] = {}
     for segment in hops(events, t_end_ns):
-        for part in detector.route(segment):
-            routed.setdefault(part.track_id, []).append(part)
+        for track_id, part in detector.route(segment).items():
+            routed.setdefault(track_id, []).append(part)
         changes = detector.hop(segment.t_end_ns)
         if at_hop is not None:
             at_hop(segment.t_end_ns, changes)

@@ -109,11 +109,11 @@ class World:
                 self.events.setdefault(track_id, []).append(event)
             cuts = [start + HOP_NS * k // pieces for k in range(pieces + 1)]
             for early, late in zip(cuts, cuts[1:], strict=False):
-                routed = [
-                    Routed(track_id, np.array([t], np.int64), np.array([sign], np.int8))
+                routed = {
+                    track_id: Routed(np.array([t], np.int64), np.array([sign], np.int8))
                     for track_id, (t, sign) in fresh.items()
                     if early <= t < late
-                ]
+                }
                 self.received += self.slots.demodulate(routed, late)
             for track_id, sign in self.signs.items():
                 index = self.index.get(track_id, 1.0)
@@ -244,7 +244,7 @@ def test_a_slot_comes_back_when_a_confirmed_beacon_is_lost() -> None:
 def test_forgetting_gives_the_last_characters() -> None:
     world = World(parameters(1), {1: 1}).run(3)
     t_ns = world.t_ns
-    routed = [Routed(1, np.array([t_ns + 9_000_000], np.int64), np.array([1], np.int8))]
+    routed = {1: Routed(np.array([t_ns + 9_000_000], np.int64), np.array([1], np.int8))}
     assert world.slots.demodulate(routed, t_ns + 9_500_000) == []
     (last,) = world.slots.forget(1)
     assert (last.track_id, last.character.t_ns) == (1, t_ns + 9_000_000)
@@ -255,7 +255,7 @@ def test_forgetting_gives_the_last_characters() -> None:
 def test_flush_gives_the_last_characters_of_all() -> None:
     world = World(parameters(2), {1: 1, 2: 1}).run(3)
     t_ns = world.t_ns + 9_000_000
-    routed = [Routed(k, np.array([t_ns + k], np.int64), np.array([1], np.int8)) for k in (2, 1)]
+    routed = {k: Routed(np.array([t_ns + k], np.int64), np.array([1], np.int8)) for k in (2, 1)}
     world.slots.demodulate(routed, t_ns + 100)
     assert [r.track_id for r in world.slots.flush()] == [1, 2]
 
@@ -263,8 +263,8 @@ def test_flush_gives_the_last_characters_of_all() -> None:
 def test_time_reaches_demodulators_without_events() -> None:
     world = World(parameters(1), {1: 1}).run(3)
     t_ns = world.t_ns
-    world.slots.demodulate([Routed(1, np.array([t_ns], np.int64), np.array([1], np.int8))], t_ns + 1)
-    assert [r.character.t_ns for r in world.slots.demodulate([], t_ns + 9_000_000)] == [t_ns]
+    world.slots.demodulate({1: Routed(np.array([t_ns], np.int64), np.array([1], np.int8))}, t_ns + 1)
+    assert [r.character.t_ns for r in world.slots.demodulate({}, t_ns + 9_000_000)] == [t_ns]
 
 
 def test_characters_held_until_a_rate_is_settled_are_judged_in_order() -> None:

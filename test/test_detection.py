@@ -31,8 +31,8 @@ def in_pieces(detector, events, cuts):
     at_hops = np.searchsorted(events.t_ns, np.arange(t_hop, events.t_end_ns, HOP_NS))
     bounds = sorted({0, len(events), *at_hops.tolist(), *cuts})
     for start, stop in zip(bounds, bounds[1:], strict=False):
-        for part in detector.route(events.slice(start, stop, int(events.t_ns[stop - 1]))):
-            routed.setdefault(part.track_id, []).append(part)
+        for track_id, part in detector.route(events.slice(start, stop, int(events.t_ns[stop - 1]))).items():
+            routed.setdefault(track_id, []).append(part)
         if stop in at_hops:
             changes = detector.hop(t_hop)
             seen.append((t_hop, [t.track_id for t in changes.new], [t.track_id for t in changes.lost]))
@@ -227,7 +227,7 @@ def test_more_blobs_than_tracks_wait():
 
 def test_nothing_comes_of_nothing():
     detector = Detector(Parameters(), SIZE)
-    assert detector.route(EventBatch.empty(T0_NS)) == []
+    assert detector.route(EventBatch.empty(T0_NS)) == {}
     assert detector.hop(T0_NS // HOP_NS * HOP_NS) == detector.hop(T0_NS // HOP_NS * HOP_NS)
     assert detector.idle and not detector.tracks
     with pytest.raises(KeyError):

@@ -63,10 +63,10 @@ def clutter(parameters: Parameters, monkeypatch: pytest.MonkeyPatch, tracks: int
     nothing = np.empty(0, np.int64), np.empty(0, np.int8)
     for t_ns in range(0, round(seconds * NS), 10_000_000):
         slots.assign(seen, t_ns, lambda _: nothing)
-        routed = []
+        routed = {}
         for k, (times, polarity) in events.items():
             part = slice(*np.searchsorted(times, (t_ns, t_ns + 10_000_000)))
-            routed.append(Routed(k, times[part], polarity[part]))
+            routed[k] = Routed(times[part], polarity[part])
         assert slots.demodulate(routed, t_ns + 10_000_000) == []
     return spent[0]
 

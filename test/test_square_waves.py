@@ -119,10 +119,10 @@ def test_a_lamp_that_reads_as_valid_characters_makes_room_for_a_beacon() -> None
             return times[first:end], polarity[first:end]
 
         received = slots.assign(tracks, t_ns, backlog)
-        routed = []
+        routed = {}
         for track_id, (times, polarity) in streams.items():
             first, end = np.searchsorted(times, [t_ns, t_ns + 10_000_000])
-            routed.append(Routed(track_id, times[first:end], polarity[first:end]))
+            routed[track_id] = Routed(times[first:end], polarity[first:end])
         received += slots.demodulate(routed, t_ns + 10_000_000)
         lamp_codes |= {r.character.code for r in received if r.track_id == 1}
     assert slots.confirmed == (2,)

@@ -22,7 +22,7 @@ are neither given out nor counted, whatever a demodulator made of the hole.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
@@ -139,8 +139,7 @@ class _Tried:
     read_to_ns: int | None
 
 
-_NO_TIMES: Times = np.empty(0, np.int64)
-_NO_POLARITIES: Polarities = np.empty(0, np.int8)
+_NO_EVENTS = Routed(np.empty(0, np.int64), np.empty(0, np.int8))
 
 
 class CandidateSlots:
@@ -213,21 +212,19 @@ class CandidateSlots:
                 track.tried_ns = self._tried[track_id].ended_ns
         return sorted(received, key=_by_time)
 
-    def demodulate(self, routed: Iterable[Routed], t_end_ns: int) -> list[ReceivedCharacter]:
+    def demodulate(self, routed: Mapping[int, Routed], t_end_ns: int) -> list[ReceivedCharacter]:
         """Hand the slots their events, and time to those without, so that a silence ends a character.
 
         Args:
-            routed: new events, each track at most once; tracks without a slot are passed over.
+            routed: new events by label; tracks without a slot are passed over.
             t_end_ns: time up to which the stream is known (ns), never past the next hop.
 
         Returns:
             The finished characters, in order of time; a track confirmed by one is confirmed from now on.
         """
-        events = {track.track_id: track for track in routed}
         received = []
         for track_id, slot in self._slots.items():
-            track = events.get(track_id)
-            t_ns, polarity = (_NO_TIMES, _NO_POLARITIES) if track is None else (track.t_ns, track.polarity)
+            t_ns, polarity = routed.get(track_id, _NO_EVENTS)
             received += slot.judge(track_id, slot.demodulator.push(t_ns, polarity, t_end_ns))
         return sorted(received, key=_by_time)
 

@@ -27,7 +27,7 @@ from beacon_comm.core.index_image import IndexImages, hop_length_ns
 from beacon_comm.core.motion_tracks import MotionTracker
 from beacon_comm.core.nearest import cell_lists, cells_along, cells_with_members, events_in
 from beacon_comm.core.parameters import Parameters
-from beacon_comm.core.routing import Routed, Router
+from beacon_comm.core.routing import RoutedEvents, Router
 from beacon_comm.core.tracks import Track, TrackChanges, Tracker
 
 
@@ -73,6 +73,8 @@ class Detector:
         self._follows = parameters.tracker == 'motion'
         self._tracker = MotionTracker(parameters, sensor_size) if self._follows else Tracker(parameters, sensor_size)
         self._buffers: dict[int, EventBuffer] = {}
+        self._routed: list[RoutedEvents] = []  # since the last hop
+        self._nothing = RoutedEvents.of({})
         self._stats = DetectionStats()
         self._outside_before = self._overflow_before = 0
         self._start(sensor_size)
@@ -105,14 +107,14 @@ class Detector:
         self._stats.window_overflow_events = self._overflow_before + self._images.overflow_events
         return self._stats
 
-    def route(self, segment: EventBatch) -> list[Routed]:
+    def route(self, segment: EventBatch) -> RoutedEvents:
         """Route the events of one hop interval, or of a part of it, by the tracks at the last hop.
 
         Returns:
-            The events of each track that got any; they are in the tracks' buffers, too.
+            The events of each track that got any; they get into the tracks' buffers, too.
         """
         if len(segment) == 0:
-            return []
+            return self._nothing
         t_hop_ns = int(segment.t_ns[0]) // self._hop_ns * self._hop_ns
         if self._t_hop_ns is None:
             self._t_hop_ns = t_hop_ns
@@ -121,9 +123,9 @@ class Detector:
             self._early = self.hop(t_hop_ns)
         routed = self._router.route(segment)
         self._stats.events += len(segment)
-        for part in routed:
-            self._stats.routed_events += len(part.t_ns)
-            self._buffers[part.track_id].append(part.t_ns, part.polarity)
+        self._stats.routed_events += routed.count
+        if routed.count:
+            self._routed.append(routed)
         return routed
 
     def hop(self, t_hop_ns: int) -> TrackChanges:
@@ -159,6 +161,7 @@ class Detector:
         Raises:
             KeyError: no such track.
         """
+        self._fill_buffers()
         return self._buffers[track_id].events()
 
     def resize(self, sensor_size: tuple[int, int]) -> TrackChanges:
@@ -168,6 +171,7 @@ class Detector:
         changes = TrackChanges(lost=self._early.lost + self._tracker.clear(sensor_size).lost)
         self._stats.lost_tracks += len(changes.lost) - len(self._early.lost)
         self._buffers.clear()
+        self._routed.clear()
         self._start(sensor_size)
         return changes
 
@@ -177,6 +181,7 @@ class Detector:
 
     def _step(self, t_hop_ns: int) -> TrackChanges:
         """Take one hop; the paper's detection, one call a stage."""
+        self._fill_buffers()
         self._images.push(self._router.close())
         self._exchange()
         blobs = self._blobs.find(self._images, t_hop_ns)
@@ -189,6 +194,13 @@ class Detector:
         self._stats.new_tracks += len(changes.new)
         self._stats.lost_tracks += len(changes.lost)
         return changes
+
+    def _fill_buffers(self) -> None:
+        """Hand the tracks' buffers what was routed since the last hop."""
+        if self._routed:
+            for track_id, part in RoutedEvents.joined(self._routed).items():
+                self._buffers[track_id].append(part.t_ns, part.polarity)
+            self._routed.clear()
 
     def _exchange(self) -> None:
         for one, other in self._to_exchange:

@@ -72,7 +72,7 @@ from beacon_comm.core.motion import (
 from beacon_comm.core.motion_tracks import MotionTrack
 from beacon_comm.core.nearest import cells_along, cells_with_members, list_cells
 from beacon_comm.core.parameters import Parameters
-from beacon_comm.core.routing import Router, cell_of
+from beacon_comm.core.routing import Router, cell_of, places
 from beacon_comm.core.tracks import Track
 
 STEPS = 10  # of a hop
@@ -123,7 +123,7 @@ class FollowingRouter(Router):
         """Route by ``tracks`` in the hop interval that begins at ``t_hop_ns`` (ns)."""
         followed: list[MotionTrack] = [track for track in tracks if isinstance(track, MotionTrack)]
         self._tracks = followed
-        self._track_ids = [track.track_id for track in tracks]
+        self._place = places(tracks)
         self._t_hop_ns = t_hop_ns
         self._state = np.empty((len(followed), motion.WIDTH))
         for k, track in enumerate(followed):

@@ -8,12 +8,14 @@ The tracks as they stood at the last hop decide until the next one.  Centres mov
 The routed events are sorted by track, stably, into one array:
 
     t_ns, polarity   [ events of track a | of track b | … ]        each in order of time
+
+Hundreds of tracks may have a few events each in a packet: nothing is done for each of them but what somebody asks for.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -35,14 +37,81 @@ class Routed(NamedTuple):
     """Events of one track.
 
     Attributes:
-        track_id: its label.
         t_ns: sensor time (ns), ``(n,)`` int64.
         polarity: ±1, ``(n,)`` int8.
     """
 
-    track_id: int
     t_ns: NDArray[np.int64]
     polarity: NDArray[np.int8]
+
+
+class RoutedEvents(Mapping[int, Routed]):
+    """The events of each track that got any, by its label.
+
+    Args:
+        place: of each track by its label, in order.
+        t_ns, polarity: sorted by track, as in :class:`Routed`.
+        stops: where each track's events end, ``(tracks,)`` int64.
+    """
+
+    __slots__ = ('_place', '_polarity', '_stops', '_t_ns')
+
+    def __init__(
+        self, place: Mapping[int, int], t_ns: NDArray[np.int64], polarity: NDArray[np.int8], stops: NDArray[np.int64]
+    ) -> None:
+        self._place = place
+        self._t_ns = t_ns
+        self._polarity = polarity
+        self._stops = stops
+
+    @classmethod
+    def of(cls, parts: Mapping[int, Routed]) -> RoutedEvents:
+        """Return what was routed to each track, which may be nothing."""
+        stops = np.cumsum([len(part.t_ns) for part in parts.values()], dtype=np.int64)
+        t_ns = np.concatenate([np.empty(0, np.int64), *(part.t_ns for part in parts.values())])
+        polarity = np.concatenate([np.empty(0, np.int8), *(part.polarity for part in parts.values())])
+        return cls({track_id: k for k, track_id in enumerate(parts)}, t_ns, polarity, stops)
+
+    @classmethod
+    def joined(cls, parts: Sequence[RoutedEvents]) -> RoutedEvents:
+        """Return what was routed in some parts of a hop interval, one after the other; at least one."""
+        if len(parts) == 1:
+            return parts[0]
+        owner = np.concatenate([part._owners() for part in parts])
+        order = np.argsort(owner, kind='stable')
+        t_ns = np.concatenate([part._t_ns for part in parts])[order]
+        polarity = np.concatenate([part._polarity for part in parts])[order]
+        return cls(parts[0]._place, t_ns, polarity, np.sum([part._stops for part in parts], axis=0))
+
+    def _owners(self) -> NDArray[np.uint16]:
+        return np.repeat(np.arange(len(self._stops), dtype=np.uint16), np.diff(self._stops, prepend=0))
+
+    @property
+    def count(self) -> int:
+        """How many events there are."""
+        return len(self._t_ns)
+
+    def __getitem__(self, track_id: int) -> Routed:
+        k = self._place[track_id]
+        start, stop = int(self._stops[k - 1]) if k else 0, int(self._stops[k])
+        if start == stop:
+            raise KeyError(track_id)
+        return Routed(self._t_ns[start:stop], self._polarity[start:stop])
+
+    def __iter__(self) -> Iterator[int]:
+        start = 0
+        for track_id, stop in zip(self._place, self._stops.tolist(), strict=True):
+            if stop > start:
+                yield track_id
+            start = stop
+
+    def __len__(self) -> int:
+        return int(np.count_nonzero(np.diff(self._stops, prepend=0)))
+
+
+def places(tracks: Sequence[Track]) -> dict[int, int]:
+    """Return the place of each track by its label."""
+    return {track.track_id: k for k, track in enumerate(tracks)}
 
 
 class Router:
@@ -64,6 +133,7 @@ class Router:
         self._index, self._owner = np.empty(_FIRST_ROOM, np.int32), np.empty(_FIRST_ROOM, np.int32)
         self._counts = HopCounts(self._grid)
         self._gathered = 0
+        self._nothing = RoutedEvents.of({})
         self.outside_events = 0
         self.aim((), 0)
 
@@ -74,7 +144,7 @@ class Router:
 
     def aim(self, tracks: Sequence[Track], t_hop_ns: int) -> None:
         """Route by ``tracks`` in the hop interval that begins at ``t_hop_ns`` (ns)."""
-        self._track_ids = [track.track_id for track in tracks]
+        self._place = places(tracks)
         self._t_hop_ns = t_hop_ns
         now, then = positions_at(tracks, t_hop_ns), positions_at(tracks, t_hop_ns + self._hop_ns)
         radius = np.array([track.extent_px for track in tracks]) * self._factor + self._margin
@@ -84,17 +154,17 @@ class Router:
         self._circle = circle
         self._first, self._member = cell_lists(box, self._grid.width, self._grid.height)
 
-    def route(self, segment: EventBatch) -> list[Routed]:
+    def route(self, segment: EventBatch) -> RoutedEvents:
         """Return the events of each track that got any, in order of the tracks' labels."""
         if len(segment) == 0:
-            return []
+            return self._nothing
         start = self._gathered
         if not self._pack(segment):
             segment = self._on_sensor(segment)
             self._pack(segment)
         n = len(segment)
         code = self._code[start : start + n]
-        routed = self._own(segment, code) if self._track_ids else []
+        routed = self._own(segment, code) if self._place else self._nothing
         kept = self._keep(start, n)
         self._counts.add(code[:kept])
         self._gathered += kept
@@ -126,21 +196,15 @@ class Router:
             segment.x[kept], segment.y[kept], segment.polarity[kept], segment.t_ns[kept], segment.t_end_ns
         )
 
-    def _own(self, segment: EventBatch, code: NDArray[np.uint32]) -> list[Routed]:
+    def _own(self, segment: EventBatch, code: NDArray[np.uint32]) -> RoutedEvents:
         """Return each track's events, and flag them in ``code``."""
-        count = np.zeros(len(self._track_ids) + 1, np.int64)
-        routed = self._find_owners(segment, code, count[1:])
+        count = np.zeros(len(self._place), np.int64)
+        routed = self._find_owners(segment, code, count)
         if routed == 0:
-            return []
+            return self._nothing
         t_ns, polarity = np.empty(routed, np.int64), np.empty(routed, np.int8)
-        ends = np.cumsum(count)  # and the end of all, behind the last track's begin
-        _sort(self._index[:routed], self._owner, segment.t_ns, segment.polarity, ends, t_ns, polarity)
-        stops = ends.tolist()  # after sorting: where each track's events end
-        return [
-            Routed(track_id, t_ns[start:stop], polarity[start:stop])
-            for track_id, start, stop in zip(self._track_ids, [0, *stops], stops, strict=False)
-            if stop > start
-        ]
+        _sort(self._index[:routed], self._owner, segment.t_ns, segment.polarity, count, t_ns, polarity)
+        return RoutedEvents(self._place, t_ns, polarity, count)
 
     def _find_owners(self, segment: EventBatch, code: NDArray[np.uint32], count: NDArray[np.int64]) -> int:
         """List the events that are of a track, with their tracks; return how many."""
@@ -226,7 +290,12 @@ def cell_of(x, y, cells_across):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _sort(index, owner, t_ns, polarity, end, sorted_t_ns, sorted_polarity):  # type: ignore[no-untyped-def]
-    """Sort the routed events by track; ``end`` begins as where each track's events begin and ends as where they end."""
+    """Sort the routed events by track; ``end`` begins as how many each has, and ends as where they end."""
+    begin = 0
+    for k in range(len(end)):
+        count = end[k]
+        end[k] = begin
+        begin += count
     for i in range(len(index)):
         at = end[owner[i]]
         end[owner[i]] = at + 1

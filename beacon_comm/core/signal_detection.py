@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from beacon_comm.core.event_buffer import EventBuffer, buffer_length_ns
 from beacon_comm.core.events import NS_PER_S, EventBatch
 from beacon_comm.core.parameters import Parameters
-from beacon_comm.core.routing import Routed
+from beacon_comm.core.routing import Routed, RoutedEvents
 from beacon_comm.core.tracks import Track, TrackChanges
 
 
@@ -43,13 +43,13 @@ class WholeSignal:
         """Whether nothing can change at coming hops without events."""
         return not self._tracks and self._newest_ns is None
 
-    def route(self, segment: EventBatch) -> list[Routed]:
+    def route(self, segment: EventBatch) -> RoutedEvents:
         """Buffer the events; give them to the track, if there is one yet."""
         if len(segment) == 0:
-            return []
+            return RoutedEvents.of({})
         self._newest_ns = int(segment.t_ns[-1])
         self._buffer.append(segment.t_ns, segment.polarity)
-        return [Routed(track_id, segment.t_ns, segment.polarity) for track_id in self._tracks]
+        return RoutedEvents.of({track_id: Routed(segment.t_ns, segment.polarity) for track_id in self._tracks})
 
     def hop(self, t_hop_ns: int) -> TrackChanges:
         """Begin, keep or lose the track at ``t_hop_ns`` (ns)."""

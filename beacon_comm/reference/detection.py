@@ -22,7 +22,7 @@ from beacon_comm.core.event_buffer import EventBuffer
 from beacon_comm.core.events import EventBatch
 from beacon_comm.core.index_image import hop_length_ns, window_hops
 from beacon_comm.core.parameters import Parameters
-from beacon_comm.core.routing import Routed
+from beacon_comm.core.routing import Routed, RoutedEvents
 from beacon_comm.core.tracks import Track, TrackChanges, positions_at
 
 
@@ -73,7 +73,7 @@ class ReferenceRouter:
         self._centre, self._speed = now, (then - now) / self._hop_ns
         self._radius = np.array([track.extent_px for track in tracks]) * p.routing_extent_factor + p.routing_margin_px
 
-    def route(self, segment: EventBatch) -> list[Routed]:
+    def route(self, segment: EventBatch) -> RoutedEvents:
         """Return the events of each track that got any, in order of the tracks' labels."""
         inside = (segment.x < self._size[0]) & (segment.y < self._size[1])
         self.outside_events += int((~inside).sum())
@@ -88,11 +88,9 @@ class ReferenceRouter:
             nearer = (distance2 <= self._radius[k] ** 2) & (distance2 < nearest2)
             owner[nearer], nearest2[nearer] = k, distance2[nearer]
         self._parts.append(ReferenceEvents(x, y, polarity > 0, t_ns, owner >= 0))
-        return [
-            Routed(track_id, t_ns[owner == k], polarity[owner == k])
-            for k, track_id in enumerate(self._track_ids)
-            if (owner == k).any()
-        ]
+        return RoutedEvents.of(
+            {track_id: Routed(t_ns[owner == k], polarity[owner == k]) for k, track_id in enumerate(self._track_ids)}
+        )
 
     def settle(self) -> None:
         """Tracks stay as they were at the last hop."""
