@@ -12,7 +12,7 @@ from beacon_comm.core.candidates import BeaconState, CandidateSlots, ReceivedCha
 from beacon_comm.core.character import Character, Status
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.parameters import Parameters
-from beacon_comm.core.routing import Routed
+from beacon_comm.core.routing import Routed, RoutedEvents
 from beacon_comm.core.tracks import Track
 
 T0_NS = 2**40 // 10_000_000 * 10_000_000
@@ -114,7 +114,7 @@ class World:
                     for track_id, (t, sign) in fresh.items()
                     if early <= t < late
                 }
-                self.received += self.slots.demodulate(routed, late)
+                self.received += self.slots.demodulate(RoutedEvents.of(routed), late)
             for track_id, sign in self.signs.items():
                 index = self.index.get(track_id, 1.0)
                 track = self.tracks.setdefault(track_id, Track(track_id, 0, 0, self.t_ns, 3, index, self.t_ns, self.t_ns))
@@ -245,7 +245,7 @@ def test_forgetting_gives_the_last_characters() -> None:
     world = World(parameters(1), {1: 1}).run(3)
     t_ns = world.t_ns
     routed = {1: Routed(np.array([t_ns + 9_000_000], np.int64), np.array([1], np.int8))}
-    assert world.slots.demodulate(routed, t_ns + 9_500_000) == []
+    assert world.slots.demodulate(RoutedEvents.of(routed), t_ns + 9_500_000) == []
     (last,) = world.slots.forget(1)
     assert (last.track_id, last.character.t_ns) == (1, t_ns + 9_000_000)
     assert world.slots.state(1) is WAITING and world.slots.record(1) is None
@@ -256,15 +256,16 @@ def test_flush_gives_the_last_characters_of_all() -> None:
     world = World(parameters(2), {1: 1, 2: 1}).run(3)
     t_ns = world.t_ns + 9_000_000
     routed = {k: Routed(np.array([t_ns + k], np.int64), np.array([1], np.int8)) for k in (2, 1)}
-    world.slots.demodulate(routed, t_ns + 100)
+    world.slots.demodulate(RoutedEvents.of(routed), t_ns + 100)
     assert [r.track_id for r in world.slots.flush()] == [1, 2]
 
 
 def test_time_reaches_demodulators_without_events() -> None:
     world = World(parameters(1), {1: 1}).run(3)
     t_ns = world.t_ns
-    world.slots.demodulate({1: Routed(np.array([t_ns], np.int64), np.array([1], np.int8))}, t_ns + 1)
-    assert [r.character.t_ns for r in world.slots.demodulate({}, t_ns + 9_000_000)] == [t_ns]
+    routed = {1: Routed(np.array([t_ns], np.int64), np.array([1], np.int8))}
+    world.slots.demodulate(RoutedEvents.of(routed), t_ns + 1)
+    assert [r.character.t_ns for r in world.slots.demodulate(RoutedEvents.of({}), t_ns + 9_000_000)] == [t_ns]
 
 
 def test_characters_held_until_a_rate_is_settled_are_judged_in_order() -> None:

@@ -6,7 +6,7 @@ import pytest
 from beacon_comm.core.candidates import CandidateSlots
 from beacon_comm.core.demodulator import make_demodulator
 from beacon_comm.core.parameters import Parameters
-from beacon_comm.core.routing import Routed
+from beacon_comm.core.routing import Routed, RoutedEvents
 from beacon_comm.core.search_pace import BIT_COST_S, BURST_S, EVENT_COST_S, SearchPace
 from beacon_comm.core.tracks import Track
 from beacon_comm.simulation.led import noise
@@ -67,7 +67,7 @@ def clutter(parameters: Parameters, monkeypatch: pytest.MonkeyPatch, tracks: int
         for k, (times, polarity) in events.items():
             part = slice(*np.searchsorted(times, (t_ns, t_ns + 10_000_000)))
             routed[k] = Routed(times[part], polarity[part])
-        assert slots.demodulate(routed, t_ns + 10_000_000) == []
+        assert slots.demodulate(RoutedEvents.of(routed), t_ns + 10_000_000) == []
     return spent[0]
 
 

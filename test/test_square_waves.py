@@ -15,7 +15,7 @@ from beacon_comm.core.character import Character
 from beacon_comm.core.confirmation import ParityRecord, Verdict
 from beacon_comm.core.demodulator import make_demodulator
 from beacon_comm.core.parameters import Parameters
-from beacon_comm.core.routing import Routed
+from beacon_comm.core.routing import Routed, RoutedEvents
 from beacon_comm.core.tracks import Track
 from beacon_comm.simulation.led import Burst, LedModel, noise, simulate_text, square_wave
 
@@ -123,7 +123,7 @@ def test_a_lamp_that_reads_as_valid_characters_makes_room_for_a_beacon() -> None
         for track_id, (times, polarity) in streams.items():
             first, end = np.searchsorted(times, [t_ns, t_ns + 10_000_000])
             routed[track_id] = Routed(times[first:end], polarity[first:end])
-        received += slots.demodulate(routed, t_ns + 10_000_000)
+        received += slots.demodulate(RoutedEvents.of(routed), t_ns + 10_000_000)
         lamp_codes |= {r.character.code for r in received if r.track_id == 1}
     assert slots.confirmed == (2,)
     assert lamp_codes  # it was read, and had right parity

@@ -36,7 +36,7 @@ from beacon_comm.core.demodulator import Demodulator, GapAware, Recognising, Sea
 from beacon_comm.core.event_buffer import buffer_length_ns
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.parameters import Parameters
-from beacon_comm.core.routing import Routed
+from beacon_comm.core.routing import Routed, RoutedEvents
 from beacon_comm.core.signature import Signature
 from beacon_comm.core.tracks import Track
 
@@ -212,11 +212,11 @@ class CandidateSlots:
                 track.tried_ns = self._tried[track_id].ended_ns
         return sorted(received, key=_by_time)
 
-    def demodulate(self, routed: Mapping[int, Routed], t_end_ns: int) -> list[ReceivedCharacter]:
+    def demodulate(self, routed: RoutedEvents, t_end_ns: int) -> list[ReceivedCharacter]:
         """Hand the slots their events, and time to those without, so that a silence ends a character.
 
         Args:
-            routed: new events by label; tracks without a slot are passed over.
+            routed: new events; tracks without a slot are passed over.
             t_end_ns: time up to which the stream is known (ns), never past the next hop.
 
         Returns:
@@ -224,7 +224,7 @@ class CandidateSlots:
         """
         received = []
         for track_id, slot in self._slots.items():
-            t_ns, polarity = routed.get(track_id, _NO_EVENTS)
+            t_ns, polarity = routed.of_track(track_id) or _NO_EVENTS
             received += slot.judge(track_id, slot.demodulator.push(t_ns, polarity, t_end_ns))
         return sorted(received, key=_by_time)
 

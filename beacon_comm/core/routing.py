@@ -91,12 +91,19 @@ class RoutedEvents(Mapping[int, Routed]):
         """How many events there are."""
         return len(self._t_ns)
 
+    def of_track(self, track_id: int) -> Routed | None:
+        """Return the events of a track, None if it got none."""
+        k = self._place.get(track_id)
+        if k is None:
+            return None
+        start, stop = self._stops[k - 1] if k else 0, self._stops[k]
+        return Routed(self._t_ns[start:stop], self._polarity[start:stop]) if start < stop else None
+
     def __getitem__(self, track_id: int) -> Routed:
-        k = self._place[track_id]
-        start, stop = int(self._stops[k - 1]) if k else 0, int(self._stops[k])
-        if start == stop:
+        routed = self.of_track(track_id)
+        if routed is None:
             raise KeyError(track_id)
-        return Routed(self._t_ns[start:stop], self._polarity[start:stop])
+        return routed
 
     def __iter__(self) -> Iterator[int]:
         start = 0

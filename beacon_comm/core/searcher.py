@@ -129,6 +129,10 @@ class RateSearcher:
         looks = [begun.now for begun in self._begun.values()]
         return min([t, *looks, *(search.due for search in self._searches if not search.made)]) - self.longest
 
+    def rests(self, t: float) -> bool:
+        """Return whether nothing is to be done up to the time ``t`` (ns)."""
+        return t < self._rests_until
+
     def search(self, t: Times, polarity: Polarities, usable_from: float, t_end: float) -> Found | None:
         """Go on up to the time ``t_end`` (ns); return the first lock that is found by then.
 
@@ -136,8 +140,6 @@ class RateSearcher:
             t, polarity: the events, those since :meth:`needed_from` among them; views that stay as they are.
             usable_from: those before this (ns) are not looked at.
         """
-        if t_end < self._rests_until:
-            return None
         while True:
             at, kind = min(((self._next_at(kind), kind) for kind in self._paces), key=lambda entry: entry[0])
             if not at <= t_end:

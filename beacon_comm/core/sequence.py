@@ -163,6 +163,8 @@ class SequenceDemodulator:
                     self._unlock(reread=status == LOST)
                 elif status != FULL:
                     break
+            elif self._searcher.rests(t_end):
+                break
             else:
                 found = self._searcher.search(self._t, self._polarity, self._usable_from, t_end)
                 if found is None:
