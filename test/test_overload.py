@@ -125,7 +125,7 @@ def test_who_is_late_searches_less_and_as_much_as_before_a_second_later(late: st
     else:
         session.live.hurry()
     session.push(stream[21:100])
-    assert slots.search_share == 0.1
+    assert slots.search_share == 0.2
     session.push(stream[100:250])
     assert slots.search_share == 1.0
     session.live.shed(session.now_ns)

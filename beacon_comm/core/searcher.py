@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from beacon_comm.core.acquisition import Lock, Look, acquiring, finish
+from beacon_comm.core.acquisition import Lock, Look, acquiring, look_at_once
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.rate_search import RateSearch, make_searches
@@ -158,7 +158,7 @@ class RateSearcher:
                 self._rests_until = min(self._rests_until, self._paces[kind].when(begun.pieces / PIECES))
         return None
 
-    def finish(self, t: Times, usable_from: float) -> Found | None:
+    def end_looks(self, t: Times, usable_from: float) -> Found | None:
         """Bring what has begun to an end now: the stream ends."""
         while self._begun:
             kind = min(self._begun, key=lambda kind: self._paces[kind].done_at)
@@ -169,36 +169,39 @@ class RateSearcher:
 
     def look_at_all(self, t: Times, polarity: Polarities, usable_from: float, t_end: float) -> Found | None:
         """Look for every rate a last time: the stream ends, and a short message may still wait for the slower ones."""
-        first = self._first(t, max(usable_from, t_end - self.longest), len(t))
+        first = self._first(t, max(usable_from, t_end - self.longest), math.inf)
         windows = [(search, search.window(t, float(t[-1]), first, len(t))) for search in self._searches]
-        locks = [finish(self._look(search, t[w], polarity[w])) for search, w in windows if w is not None]
+        locks = [look_at_once(self._look(search, t[w], polarity[w])) for search, w in windows if w is not None]
         best = max((lock for lock in locks if lock is not None), key=lambda lock: lock.verdict.merit, default=None)
         return None if best is None else Found(best, float(t[-1]), first)
 
     def _next_at(self, kind: Kind) -> float:
         """Return when a look of a kind is done, or the next one may begin."""
-        ready = self._paces[kind].done_at
-        return ready if kind in self._begun else max(self._next(kind).due, ready)
+        pace = self._paces[kind]
+        return pace.done_at if kind in self._begun else max(self._next(kind).due, pace.ready_at)
 
     def _next(self, kind: Kind) -> RateSearch:
-        """Return the search that is next."""
-        return min((s for s in self._searches if isinstance(s, kind)), key=lambda search: (search.due, search.wanted))
+        """Return the search that is next: of those that wait, one that has not looked yet, or that wanted to look first."""
+        ready = self._paces[kind].ready_at
+        return min((s for s in self._searches if isinstance(s, kind)), key=lambda s: (max(s.due, ready), s.made > 0, s.wanted))
 
-    def _first(self, t: Times, usable_from: float, stop: int) -> int:
-        return max(int(np.searchsorted(t, usable_from)), stop - self._most_events)
+    def _first(self, t: Times, usable_from: float, at: float) -> int:
+        """Return the first event that may be used at the time ``at`` (ns)."""
+        return max(int(np.searchsorted(t, usable_from)), int(np.searchsorted(t, at)) - self._most_events)
 
     def _begin(self, kind: Kind, at: float, t: Times, polarity: Polarities, usable_from: float) -> None:
         """Begin a look at the time ``at`` (ns); a search's first one looks at its own time, however late it begins."""
         search = self._next(kind)
         if search.made and search.due < at:
             search.postpone(at)
-        now = search.due
+        now = min(search.due, at)
         stop = int(np.searchsorted(t, now))
-        first = self._first(t, usable_from, stop)
+        first = self._first(t, usable_from, at)
         window = search.window(t, now, first, stop)
         if window is None:  # nothing there: wait for the next event
-            self._asleep |= stop == len(t)
-            search.restart(float(t[stop]) if stop < len(t) else math.inf)
+            later = max(stop, first)
+            self._asleep |= later >= len(t)
+            search.restart(float(t[later]) if later < len(t) else math.inf)
             return
         self._paces[kind].begin(at, (now - float(t[window.start])) / search.period, window.stop - window.start)
         # That a rate is listed says enough: blind searches are not asked about it.
@@ -216,7 +219,7 @@ class RateSearcher:
         if begun.lock is None:
             return None
         self._begun.clear()
-        return Found(begun.lock, begun.now, self._first(t, usable_from, int(np.searchsorted(t, at))))
+        return Found(begun.lock, begun.now, self._first(t, usable_from, at))
 
     def _look(self, search: RateSearch, t: Times, polarity: Polarities) -> Look:
         """Look at a window for a search's periods."""

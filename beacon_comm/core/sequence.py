@@ -313,7 +313,7 @@ class SequenceDemodulator:
     def _search_the_last(self) -> None:
         """Search what the stream's end has left."""
         t, polarity = self._t, self._polarity
-        found = self._searcher.finish(t, self._usable_from)
+        found = self._searcher.end_looks(t, self._usable_from)
         if found is not None:
             self._start(found)
             return

@@ -27,7 +27,7 @@ from beacon_comm.ros.stamped import Instant, StampedCharacter
 from beacon_comm.ros.stream_time import StreamTime
 from beacon_comm.wire.stream import NOTHING, Decoded, EventStream
 
-_HURRIED_SHARE, _HURRIED_NS = 0.1, NS_PER_S
+_HURRIED_SHARE, _HURRIED_NS = 0.2, NS_PER_S
 """What is left of ``search_load`` while messages wait for long or are shed, and until so much of the stream (ns) has been read
 without: searches that are cut by the next gap begin again, and would keep the node too slow for ever."""
 
