@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from line_events import text_bits
 from sequence_lines import NS, beacon_events
 
-from beacon_comm.core.acquisition import Demands, Verdict, acquire
+from beacon_comm.core.acquisition import Demands, Verdict, acquiring, look_at_once
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.likelihood import CONTEXTS, COUNTS, LEVELS
 from beacon_comm.core.rate_search import periods_around
@@ -28,7 +28,7 @@ NEAR = replace(NEAR, stray_per_s=4000.0)
 def found(events, periods, needed=4, layout=LAYOUT):
     t_ns, polarity = events
     t = (t_ns - t_ns[0]).astype(np.float64)
-    return acquire(t, polarity, np.asarray(periods), layout, Demands(needed, 3))
+    return look_at_once(acquiring(t, polarity, np.asarray(periods), layout, Demands(needed, 3)))
 
 
 def beacon(text, bit_rate_bps, skipped=0, ends_after=5, frame=None, **options):
@@ -154,7 +154,7 @@ def test_what_was_learnt_tells_ones_from_zeros():
 def test_the_window_is_left_as_it_was():
     t_ns, polarity = beacon(TEXT[:12], 1000.0)
     t, kept = t_ns.astype(np.float64), polarity.copy()
-    acquire(t, polarity, np.array([1e6]), LAYOUT, Demands(4))
+    look_at_once(acquiring(t, polarity, np.array([1e6]), LAYOUT, Demands(4)))
     assert np.array_equal(t, t_ns) and np.array_equal(polarity, kept)
 
 
@@ -204,14 +204,14 @@ def test_a_signal_read_at_twice_its_rate_is_refused(codes, skipped):
 
 def test_nothing_and_next_to_nothing_is_refused():
     empty = (np.empty(0), np.empty(0, np.int8))
-    assert acquire(*empty, np.array([1e6]), LAYOUT, Demands(4)) is None
-    assert acquire(np.zeros(3), np.ones(3, np.int8), np.array([1e6]), LAYOUT, Demands(4)) is None
+    assert look_at_once(acquiring(*empty, np.array([1e6]), LAYOUT, Demands(4))) is None
+    assert look_at_once(acquiring(np.zeros(3), np.ones(3, np.int8), np.array([1e6]), LAYOUT, Demands(4))) is None
     for count in (16, 1000):
         burst = np.zeros(count), np.ones(count, np.int8)  # all at one time
-        assert acquire(*burst, np.array([1e6]), LAYOUT, Demands(4)) is None
+        assert look_at_once(acquiring(*burst, np.array([1e6]), LAYOUT, Demands(4))) is None
     held = np.arange(0.0, 300e6, 1e4)
     for level in (1, -1):
-        assert acquire(held, np.full(len(held), level, np.int8), np.array([1e6]), LAYOUT, Demands(4)) is None
+        assert look_at_once(acquiring(held, np.full(len(held), level, np.int8), np.array([1e6]), LAYOUT, Demands(4))) is None
 
 
 def test_fewer_words_than_needed_are_refused():

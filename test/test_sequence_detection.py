@@ -5,7 +5,7 @@ import pytest
 from line_events import text_bits
 from sequence_lines import NS, beacon_events
 
-from beacon_comm.core.acquisition import Demands, acquire
+from beacon_comm.core.acquisition import Demands, acquiring, look_at_once
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.sequence_detection import (
     BORDER_OF_START,
@@ -38,7 +38,7 @@ class Locked:
 
     def __init__(self, t, polarity, learnt_from=20, rows=512):
         window = slice(0, int(np.searchsorted(t, t[0] + (learnt_from * 11 + 5) * BIT)))
-        lock = acquire(t[window], polarity[window], np.array([BIT]), LAYOUT, Demands(4))
+        lock = look_at_once(acquiring(t[window], polarity[window], np.array([BIT]), LAYOUT, Demands(4)))
         assert lock is not None
         self.clock, self.state, self.inverted = lock.clock, lock.detection, lock.inverted
         start_at(self.state, int(lock.positions[0]), 11)

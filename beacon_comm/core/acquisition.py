@@ -250,17 +250,6 @@ def look_at_once(look: Look) -> Lock | None:
             return lock
 
 
-def acquire(
-    t: NDArray[np.float64],
-    polarity: NDArray[np.int8],
-    periods: NDArray[np.float64],
-    layout: NDArray[np.void],
-    demands: Demands,
-) -> Lock | None:
-    """Look for a beacon in a window of events, all at once; see :func:`acquiring`."""
-    return look_at_once(acquiring(t, polarity, periods, layout, demands))
-
-
 def acquiring(
     t: NDArray[np.float64],
     polarity: NDArray[np.int8],

@@ -9,7 +9,7 @@
 A *listed* rate is looked for within 2.5 % of its nominal value: cheap oscillators are off by 2 %.
 
 *Blind*, 100 bps to 10 kbps are looked for octave by octave, the fast ones first because their windows are short.  Two
-statements about the signed events s(t) of a window name periods, and :func:`beacon_comm.core.acquisition.acquire`
+statements about the signed events s(t) of a window name periods, and :func:`beacon_comm.core.acquisition.acquiring`
 decides:
 
 - characters follow one another, and all have a start bit and stop bits: the autocorrelation of s peaks at multiples of

@@ -18,7 +18,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from beacon_comm.core.acquisition import Demands, Lock, acquire
+from beacon_comm.core.acquisition import Demands, Lock, acquiring, look_at_once
 from beacon_comm.core.character import Character, Status
 from beacon_comm.core.event_buffer import EVENT_BYTES, EventArrays
 from beacon_comm.core.events import NS_PER_S
@@ -248,13 +248,8 @@ class SequenceDemodulator:
         first = int(np.searchsorted(self._t, self._refine_at - REFINED_AFTER * self._frame.length * period))
         self._refine_at = math.inf
         window = slice(first, stop)
-        better = acquire(
-            self._t[window],
-            self._polarity[window],
-            period * REFINED_PERIODS,
-            self._layout,
-            REFINED_DEMANDS,
-        )
+        periods = period * REFINED_PERIODS
+        better = look_at_once(acquiring(self._t[window], self._polarity[window], periods, self._layout, REFINED_DEMANDS))
         if better is not None and better.inverted == lock.inverted:
             self._begin(better, max(self._given_to - 2.0 * self._frame.length * period, float(self._t[first])))
 
