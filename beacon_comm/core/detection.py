@@ -27,7 +27,7 @@ from beacon_comm.core.index_image import IndexImages, hop_length_ns
 from beacon_comm.core.motion_tracks import MotionTracker
 from beacon_comm.core.nearest import cell_lists, cells_along, cells_with_members, events_in
 from beacon_comm.core.parameters import Parameters
-from beacon_comm.core.routing import RoutedEvents, Router
+from beacon_comm.core.routing import NOTHING_ROUTED, RoutedEvents, Router
 from beacon_comm.core.tracks import Track, TrackChanges, Tracker
 
 
@@ -74,7 +74,6 @@ class Detector:
         self._tracker = MotionTracker(parameters, sensor_size) if self._follows else Tracker(parameters, sensor_size)
         self._buffers: dict[int, EventBuffer] = {}
         self._routed: list[RoutedEvents] = []  # since the last hop
-        self._nothing = RoutedEvents.of({})
         self._stats = DetectionStats()
         self._outside_before = self._overflow_before = 0
         self._start(sensor_size)
@@ -114,7 +113,7 @@ class Detector:
             The events of each track that got any; they get into the tracks' buffers, too.
         """
         if len(segment) == 0:
-            return self._nothing
+            return NOTHING_ROUTED
         t_hop_ns = int(segment.t_ns[0]) // self._hop_ns * self._hop_ns
         if self._t_hop_ns is None:
             self._t_hop_ns = t_hop_ns

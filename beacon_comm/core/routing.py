@@ -116,6 +116,9 @@ class RoutedEvents(Mapping[int, Routed]):
         return int(np.count_nonzero(np.diff(self._stops, prepend=0)))
 
 
+NOTHING_ROUTED = RoutedEvents.of({})
+
+
 def places(tracks: Sequence[Track]) -> dict[int, int]:
     """Return the place of each track by its label."""
     return {track.track_id: k for k, track in enumerate(tracks)}
@@ -140,7 +143,6 @@ class Router:
         self._index, self._owner = np.empty(_FIRST_ROOM, np.int32), np.empty(_FIRST_ROOM, np.int32)
         self._counts = HopCounts(self._grid)
         self._gathered = 0
-        self._nothing = RoutedEvents.of({})
         self.outside_events = 0
         self.aim((), 0)
 
@@ -164,14 +166,14 @@ class Router:
     def route(self, segment: EventBatch) -> RoutedEvents:
         """Return the events of each track that got any, in order of the tracks' labels."""
         if len(segment) == 0:
-            return self._nothing
+            return NOTHING_ROUTED
         start = self._gathered
         if not self._pack(segment):
             segment = self._on_sensor(segment)
             self._pack(segment)
         n = len(segment)
         code = self._code[start : start + n]
-        routed = self._own(segment, code) if self._place else self._nothing
+        routed = self._own(segment, code) if self._place else NOTHING_ROUTED
         kept = self._keep(start, n)
         self._counts.add(code[:kept])
         self._gathered += kept
@@ -208,7 +210,7 @@ class Router:
         count = np.zeros(len(self._place), np.int64)
         routed = self._find_owners(segment, code, count)
         if routed == 0:
-            return self._nothing
+            return NOTHING_ROUTED
         t_ns, polarity = np.empty(routed, np.int64), np.empty(routed, np.int8)
         _sort(self._index[:routed], self._owner, segment.t_ns, segment.polarity, count, t_ns, polarity)
         return RoutedEvents(self._place, t_ns, polarity, count)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from beacon_comm.core.event_buffer import EventBuffer, buffer_length_ns
 from beacon_comm.core.events import NS_PER_S, EventBatch
 from beacon_comm.core.parameters import Parameters
-from beacon_comm.core.routing import Routed, RoutedEvents
+from beacon_comm.core.routing import NOTHING_ROUTED, Routed, RoutedEvents
 from beacon_comm.core.tracks import Track, TrackChanges
 
 
@@ -46,7 +46,7 @@ class WholeSignal:
     def route(self, segment: EventBatch) -> RoutedEvents:
         """Buffer the events; give them to the track, if there is one yet."""
         if len(segment) == 0:
-            return RoutedEvents.of({})
+            return NOTHING_ROUTED
         self._newest_ns = int(segment.t_ns[-1])
         self._buffer.append(segment.t_ns, segment.polarity)
         return RoutedEvents.of({track_id: Routed(segment.t_ns, segment.polarity) for track_id in self._tracks})
