@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from beacon_comm.core.event_buffer import EventBuffer, buffer_length_ns
 from beacon_comm.core.events import NS_PER_S, EventBatch
 from beacon_comm.core.parameters import Parameters
-from beacon_comm.core.routing import NOTHING_ROUTED, Routed, RoutedEvents
+from beacon_comm.core.routing import NOTHING_ROUTED, RoutedEvents, places
 from beacon_comm.core.tracks import Track, TrackChanges
 
 
@@ -49,7 +49,9 @@ class WholeSignal:
             return NOTHING_ROUTED
         self._newest_ns = int(segment.t_ns[-1])
         self._buffer.append(segment.t_ns, segment.polarity)
-        return RoutedEvents.of({track_id: Routed(segment.t_ns, segment.polarity) for track_id in self._tracks})
+        if not self._tracks:
+            return NOTHING_ROUTED
+        return RoutedEvents(places(list(self._tracks.values())), segment.t_ns, segment.polarity, np.array([len(segment)]))
 
     def hop(self, t_hop_ns: int) -> TrackChanges:
         """Begin, keep or lose the track at ``t_hop_ns`` (ns)."""
