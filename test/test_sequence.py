@@ -477,6 +477,17 @@ def test_batches_give_the_same_characters_where_buffers_overflow(rates):
     assert given[0] == given[1]
 
 
+@pytest.mark.parametrize('bit_rate_bps', [504.0, 3125.0])
+def test_batches_give_the_same_characters_where_no_buffer_holds_what_a_lock_is_refined_from(bit_rate_bps):
+    t_ns, polarity = beacon_events(text_bits(PROSE * 3), bit_rate_bps)
+    given = []
+    for step_ns in (700_000, 10_000_000, 50_000_000):
+        receiver = demodulator(bit_rate_bps, buffer_max_bytes=200_000)
+        given.append(decode(receiver, t_ns, polarity, cuts=range(-step_ns, int(t_ns[-1]) + NS // 2, step_ns)))
+    assert text_of(given[0]) == PROSE * 3
+    assert given[0] == given[1] == given[2]
+
+
 def test_what_was_buffered_is_searched_no_faster():
     """And read all the same, when the search has gone on with what came after."""
     t_ns, polarity = beacon_events(text_bits(PROSE * 3), 1250.0)

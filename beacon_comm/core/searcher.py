@@ -40,11 +40,13 @@ class Found:
     Attributes:
         lock: the lock.
         now: end of the window that it was found in (ns).
+        known_at: when it was known (ns).
         first: events before this one are not to be used.
     """
 
     lock: Lock
     now: float
+    known_at: float
     first: int
 
 
@@ -169,11 +171,11 @@ class RateSearcher:
 
     def look_at_all(self, t: Times, polarity: Polarities, usable_from: float, t_end: float) -> Found | None:
         """Look for every rate a last time: the stream ends, and a short message may still wait for the slower ones."""
-        first = self._first(t, max(usable_from, t_end - self.longest), math.inf)
+        first = self.first(t, max(usable_from, t_end - self.longest), math.inf)
         windows = [(search, search.window(t, float(t[-1]), first, len(t))) for search in self._searches]
         locks = [look_at_once(self._look(search, t[w], polarity[w])) for search, w in windows if w is not None]
         best = max((lock for lock in locks if lock is not None), key=lambda lock: lock.verdict.merit, default=None)
-        return None if best is None else Found(best, float(t[-1]), first)
+        return None if best is None else Found(best, float(t[-1]), math.inf, first)
 
     def _next_at(self, kind: Kind) -> float:
         """Return when a look of a kind is done, or the next one may begin."""
@@ -185,7 +187,7 @@ class RateSearcher:
         ready = self._paces[kind].ready_at
         return min((s for s in self._searches if isinstance(s, kind)), key=lambda s: (max(s.due, ready), s.made > 0, s.wanted))
 
-    def _first(self, t: Times, usable_from: float, at: float) -> int:
+    def first(self, t: Times, usable_from: float, at: float) -> int:
         """Return the first event that may be used at the time ``at`` (ns)."""
         return max(int(np.searchsorted(t, usable_from)), int(np.searchsorted(t, at)) - self._most_events)
 
@@ -196,7 +198,7 @@ class RateSearcher:
             search.postpone(at)
         now = min(search.due, at)
         stop = int(np.searchsorted(t, now))
-        first = self._first(t, usable_from, at)
+        first = self.first(t, usable_from, at)
         window = search.window(t, now, first, stop)
         if window is None:  # nothing there: wait for the next event
             later = max(stop, first)
@@ -219,7 +221,7 @@ class RateSearcher:
         if begun.lock is None:
             return None
         self._begun.clear()
-        return Found(begun.lock, begun.now, self._first(t, usable_from, at))
+        return Found(begun.lock, begun.now, at, self.first(t, usable_from, at))
 
     def _look(self, search: RateSearch, t: Times, polarity: Polarities) -> Look:
         """Look at a window for a search's periods."""

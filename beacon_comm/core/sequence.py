@@ -99,7 +99,8 @@ class SequenceDemodulator:
         self._read_to = -math.inf  # … or read, and not given out yet
         self._refine_at = math.inf  # time at which the lock is to be refined
         self._usable_from = -math.inf  # events before this are not read again
-        self._found_at = -math.inf  # when the lock was found
+        self._found_at = -math.inf  # end of the window that the lock was found in …
+        self._known_at = -math.inf  # … and when it was known
         self._searched_to_ns: int | None = None  # by the demodulator before this one
         self._shared: tuple[float, int] | None = None  # load, from when on (ns), before the first event
 
@@ -245,7 +246,8 @@ class SequenceDemodulator:
     def _refine(self, lock: Lock, stop: int) -> None:
         """Learn phase and histograms anew from what came since the lock, and go on from the last character."""
         period = float(lock.clock['period'][0])
-        first = int(np.searchsorted(self._t, self._refine_at - REFINED_AFTER * self._frame.length * period))
+        begin = self._refine_at - REFINED_AFTER * self._frame.length * period
+        first = min(self._searcher.first(self._t, begin, max(self._refine_at, self._known_at)), stop)
         self._refine_at = math.inf
         window = slice(first, stop)
         periods = period * REFINED_PERIODS
@@ -324,7 +326,7 @@ class SequenceDemodulator:
         self._trusted = False
         self._pending = None
         self._read_to = self._given_to
-        self._found_at = now
+        self._found_at, self._known_at = now, found.known_at
         self._refine_at = border + REFINED_AFTER * self._frame.length * lock.period
         if len(lock.positions) > (REFINED_AFTER - 5) * self._frame.length:
             self._refine_at = math.inf
