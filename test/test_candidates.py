@@ -236,7 +236,7 @@ def test_a_slot_comes_back_when_a_confirmed_beacon_is_lost() -> None:
     assert sorted(world.states().values()) == [DEMODULATING, CONFIRMED, CONFIRMED, DEMOTED]
     for track_id in (1, 2):
         del world.signs[track_id], world.tracks[track_id]
-        world.slots.forget(track_id)
+        world.slots.forget(track_id, world.t_ns)
     world.run(1)
     assert world.states() == {3: DEMODULATING, 4: DEMODULATING}
 
@@ -246,10 +246,10 @@ def test_forgetting_gives_the_last_characters() -> None:
     t_ns = world.t_ns
     routed = {1: Routed(np.array([t_ns + 9_000_000], np.int64), np.array([1], np.int8))}
     assert world.slots.demodulate(RoutedEvents.of(routed), t_ns + 9_500_000) == []
-    (last,) = world.slots.forget(1)
+    (last,) = world.slots.forget(1, t_ns)
     assert (last.track_id, last.character.t_ns) == (1, t_ns + 9_000_000)
     assert world.slots.state(1) is WAITING and world.slots.record(1) is None
-    assert world.slots.forget(1) == [] and world.slots.forget(99) == []
+    assert world.slots.forget(1, t_ns) == [] and world.slots.forget(99, t_ns) == []
 
 
 def test_flush_gives_the_last_characters_of_all() -> None:

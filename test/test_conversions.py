@@ -147,7 +147,7 @@ def test_a_text_keeps_its_last_codes_and_counts_all() -> None:
 def test_a_lost_beacons_text_is_dropped() -> None:
     texts = Texts(kept=4)
     texts.add(character())
-    texts.forget(7)
+    texts.keep([8])
     assert texts.take_changed() == []
     texts.add(character())
     assert texts.take_changed()[0].first_index == 0

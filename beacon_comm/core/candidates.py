@@ -22,7 +22,7 @@ are neither given out nor counted, whatever a demodulator made of the hole.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
@@ -35,6 +35,7 @@ from beacon_comm.core.confirmation import ParityRecord
 from beacon_comm.core.demodulator import Demodulator, GapAware, Recognising, Searching
 from beacon_comm.core.event_buffer import buffer_length_ns
 from beacon_comm.core.events import NS_PER_S
+from beacon_comm.core.last_looks import LONGEST_WAIT_NS, LastLooks
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.routing import Routed, RoutedEvents
 from beacon_comm.core.signature import Signature
@@ -129,6 +130,11 @@ class _Slot:
         if isinstance(self.demodulator, GapAware):
             self.demodulator.miss(start_ns, stop_ns)
 
+    def ending(self, track_id: int) -> Iterator[list[ReceivedCharacter]]:
+        demodulator = self.demodulator
+        for part in demodulator.ending() if isinstance(demodulator, Searching) else [demodulator.flush()]:
+            yield self.judge(track_id, part)
+
 
 @dataclass(frozen=True, slots=True)
 class _Tried:
@@ -159,7 +165,8 @@ class CandidateSlots:
         self._slots: dict[int, _Slot] = {}
         self._tried: dict[int, _Tried] = {}
         self._slots_full = False
-        self._gaps = Gaps(2 * buffer_length_ns(parameters))
+        self._gaps = Gaps(2 * buffer_length_ns(parameters) + LONGEST_WAIT_NS)
+        self._last_looks = LastLooks[ReceivedCharacter](parameters.hop_s)
         self.search_share = 1.0
 
     def miss(self, start_ns: int, stop_ns: int) -> None:
@@ -188,7 +195,7 @@ class CandidateSlots:
                 of the last character that was read, so that none is given out twice.
 
         Returns:
-            What the backlogs of the slots given now read, in order of time.
+            What the backlogs of the slots given now read, and the last looks at lost tracks, in order of time.
         """
         for track_id, slot in self._slots.items():
             slot.record.advance(t_ns, tracks[track_id].quiet)
@@ -201,7 +208,7 @@ class CandidateSlots:
             given = queue[: self._free]
         search_load = self._share_search_load(len(given), t_ns)
         self._slots_full = len(queue) > len(given)
-        received = []
+        received = self._last_looks.work(self.search_share * self._p.search_load, t_ns)
         for track_id in given:
             received += self._give(track_id, t_ns, search_load, *backlog(track_id))
         for track_id, track in tracks.items():
@@ -228,18 +235,26 @@ class CandidateSlots:
             received += slot.judge(track_id, slot.demodulator.push(t_ns, polarity, t_end_ns))
         return sorted(received, key=_by_time)
 
-    def forget(self, track_id: int) -> list[ReceivedCharacter]:
-        """Drop a lost track; return the last characters of its demodulator, if it has one."""
+    def forget(self, track_id: int, t_ns: int) -> list[ReceivedCharacter]:
+        """Drop a track that is lost at ``t_ns`` (ns); return the last characters of its demodulator, if it has one.
+
+        What it finds when it looks for its bit rate a last time is for :meth:`assign` to return, a little later.
+        """
         self._tried.pop(track_id, None)
         slot = self._slots.pop(track_id, None)
-        return [] if slot is None else slot.judge(track_id, slot.demodulator.flush())
+        return [] if slot is None else self._last_looks.begin(track_id, slot.ending(track_id), t_ns)
 
     def flush(self) -> list[ReceivedCharacter]:
-        """Return the last characters of all demodulators at the end of a stream, in order of time."""
-        received = []
+        """Return the last characters of all demodulators, and of lost tracks', at the end of a stream, in order of time."""
+        received = self._last_looks.finish_all()
         for track_id, slot in self._slots.items():
             received += slot.judge(track_id, slot.demodulator.flush())
         return sorted(received, key=_by_time)
+
+    @property
+    def looking_back(self) -> bool:
+        """Lost tracks are still looked at; as of the last hop."""
+        return bool(self._last_looks)
 
     @property
     def slots_full(self) -> bool:
@@ -347,7 +362,7 @@ class CandidateSlots:
             slot.demodulator.share(search_load, t_ns)
             if tried is not None:
                 slot.demodulator.searched(tried.ended_ns)
-        received = []
+        received = self._last_looks.finish(track_id)
         for start_ns, stop_ns in self._gaps.since(int(times[first])) if first < len(times) else ():
             stop = max(first, int(np.searchsorted(times, start_ns, 'right')))
             received += slot.judge(track_id, slot.demodulator.push(times[first:stop], polarity[first:stop], start_ns))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -85,6 +86,10 @@ class Searching(Protocol):
 
     def searched(self, to_ns: int) -> None:
         """Hear, before the first events, that those before ``to_ns`` (ns) have been searched: read them, if need be."""
+        ...
+
+    def ending(self) -> Iterator[list[Character]]:
+        """Flush in parts: characters as soon as they are there, and an empty part for each piece of a look, of some 0.2 ms."""
         ...
 
 

@@ -14,7 +14,7 @@ batching of the same events gives the same characters, tracks and states.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -210,6 +210,11 @@ class Receiver:
         return self._confirmed
 
     @property
+    def track_ids(self) -> Collection[int]:
+        """Labels of all tracks."""
+        return self._detection.tracks.keys()
+
+    @property
     def slots_full(self) -> bool:
         """Whether candidates wait because every slot is taken."""
         return self._slots.slots_full
@@ -232,7 +237,7 @@ class Receiver:
             self._t_ns = int(batch.t_ns[0]) if len(batch) else batch.t_end_ns
         start = 0
         while (t_hop := (self._t_ns // hop + 1) * hop) <= batch.t_end_ns:
-            if self._detection.idle:  # nothing can change at the points before the next event
+            if self._detection.idle and not self._slots.looking_back:  # nothing can change at the points before the next event
                 next_ns = int(batch.t_ns[start]) if start < len(batch) else batch.t_end_ns
                 t_hop = max(t_hop, next_ns // hop * hop)
             stop = int(np.searchsorted(batch.t_ns, t_hop, side='left'))
@@ -270,7 +275,7 @@ class Receiver:
     ) -> None:
         for track in changes.lost:
             snapshot = self._snapshot(track, self._t_ns or 0, BeaconState.LOST)
-            characters += self._slots.forget(track.track_id)
+            characters += self._slots.forget(track.track_id, self._t_ns or 0)
             lost.append(snapshot)
 
     def _restart(self, changes: TrackChanges) -> Output:
@@ -280,7 +285,7 @@ class Receiver:
         characters: list[ReceivedCharacter] = []
         lost: list[BeaconSnapshot] = []
         self._lose(changes, characters, lost)
-        return self._output(characters, lost)
+        return self._output(characters + self._slots.flush(), lost)
 
     def _output(self, characters: list[ReceivedCharacter], lost: list[BeaconSnapshot]) -> Output:
         confirmed = self._slots.confirmed

@@ -13,12 +13,13 @@ stream: any batching gives the same.
 from __future__ import annotations
 
 import math
+from collections.abc import Generator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from beacon_comm.core.acquisition import Lock, Look, acquiring, look_at_once
+from beacon_comm.core.acquisition import Lock, Look, acquiring
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.rate_search import RateSearch, make_searches
@@ -48,6 +49,10 @@ class Found:
     now: float
     known_at: float
     first: int
+
+
+Looks = Generator[None, None, Found | None]
+"""Looks at all that is left, piece by piece; it returns what they have found."""
 
 
 @dataclass(slots=True)
@@ -160,21 +165,30 @@ class RateSearcher:
                 self._rests_until = min(self._rests_until, self._paces[kind].when(begun.pieces / PIECES))
         return None
 
-    def end_looks(self, t: Times, usable_from: float) -> Found | None:
-        """Bring what has begun to an end now: the stream ends."""
+    def end_looks(self, t: Times, usable_from: float) -> Looks:
+        """Bring what has begun to an end now, piece by piece: the stream ends."""
         while self._begun:
             kind = min(self._begun, key=lambda kind: self._paces[kind].done_at)
-            found = self._finish(self._begun.pop(kind), t, usable_from, math.inf)
+            begun = self._begun.pop(kind)
+            while begun.pieces < math.inf:
+                begun.work(begun.pieces + 1)
+                yield
+            found = self._finish(begun, t, usable_from, math.inf)
             if found is not None:
                 return found
         return None
 
-    def look_at_all(self, t: Times, polarity: Polarities, usable_from: float, t_end: float) -> Found | None:
+    def look_at_all(self, t: Times, polarity: Polarities, usable_from: float, t_end: float) -> Looks:
         """Look for every rate a last time: the stream ends, and a short message may still wait for the slower ones."""
         first = self.first(t, max(usable_from, t_end - self.longest), math.inf)
-        windows = [(search, search.window(t, float(t[-1]), first, len(t))) for search in self._searches]
-        locks = [look_at_once(self._look(search, t[w], polarity[w])) for search, w in windows if w is not None]
-        best = max((lock for lock in locks if lock is not None), key=lambda lock: lock.verdict.merit, default=None)
+        best: Lock | None = None
+        for search in self._searches:
+            window = search.window(t, float(t[-1]), first, len(t))
+            if window is None:
+                continue
+            lock = yield from self._look(search, t[window], polarity[window])
+            if lock is not None and (best is None or lock.verdict.merit > best.verdict.merit):
+                best = lock
         return None if best is None else Found(best, float(t[-1]), math.inf, first)
 
     def _next_at(self, kind: Kind) -> float:

@@ -14,6 +14,7 @@ times of the stream, whatever the batches: an attempt sees the events before its
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -197,24 +198,30 @@ class SequenceDemodulator:
 
     def flush(self) -> list[Character]:
         """End the stream; see :class:`beacon_comm.core.demodulator.Demodulator`."""
-        characters: list[Character] = []
+        return [character for part in self.ending() for character in part]
+
+    def ending(self) -> Iterator[list[Character]]:
+        """End the stream in parts; see :class:`beacon_comm.core.demodulator.Searching`."""
         while True:
             if self._lock is None and len(self._t):
-                self._search_the_last()
+                for _ in self._search_the_last():
+                    yield []
             lock = self._lock
             if lock is None:
-                return characters
+                return
             status, read = self._follow(lock, self._known_to)
-            characters += read
+            if read:
+                yield read
             if status == STILL_LOCKED:
                 break
             if status != FULL:
                 self._unlock(reread=status == LOST)
         count = end_detection(lock.clock, lock.detection, self._layout, self._rows)
-        characters += self._characters(self._rows[:count])
+        characters = self._characters(self._rows[:count])
         self._unlock(reread=True)
         self._ended = lock
-        return characters
+        if characters:
+            yield characters
 
     # Locked
 
@@ -307,14 +314,14 @@ class SequenceDemodulator:
 
     # Found
 
-    def _search_the_last(self) -> None:
-        """Search what the stream's end has left."""
+    def _search_the_last(self) -> Iterator[None]:
+        """Search what the stream's end has left, piece by piece."""
         t, polarity = self._t, self._polarity
-        found = self._searcher.end_looks(t, self._usable_from)
+        found = yield from self._searcher.end_looks(t, self._usable_from)
         if found is not None:
             self._start(found)
             return
-        found = self._searcher.look_at_all(t, polarity, self._usable_from, self._known_to)
+        found = yield from self._searcher.look_at_all(t, polarity, self._usable_from, self._known_to)
         if found is not None:
             self._start(found)
             self._refine_at = math.inf

@@ -240,9 +240,8 @@ class BeaconNode(Node):
         if self._text.get_subscription_count():  # what grows meanwhile is published once somebody comes
             for text in self._texts.take_changed():
                 self._text.publish(conversions.text_message(frame_id, text))
+        self._texts.keep(self._live.track_ids)
         lost, self._lost = self._lost, []
-        for beacon in lost:
-            self._texts.forget(beacon.track_id)
         wants_beacons, wants_bearings = self._beacons.get_subscription_count(), self._bearings.get_subscription_count()
         if self._live.sensor_size is None or not (wants_beacons or wants_bearings):
             return

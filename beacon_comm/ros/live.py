@@ -12,7 +12,7 @@ It knows no ROS: the node gives it bytes and the time, and publishes what it ret
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import NamedTuple
 
 from beacon_comm.core.bearing import CameraModel
@@ -102,6 +102,11 @@ class LiveReceiver:
     def confirmed(self) -> tuple[int, ...]:
         """Labels of the confirmed beacons."""
         return () if self._receiver is None else self._receiver.confirmed
+
+    @property
+    def track_ids(self) -> Collection[int]:
+        """Labels of all tracks."""
+        return () if self._receiver is None else self._receiver.track_ids
 
     @property
     def calibrated(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 
 from beacon_comm.ros.stamped import Instant, StampedCharacter
@@ -70,10 +71,11 @@ class Texts:
         self._changed.clear()
         return texts
 
-    def forget(self, track_id: int) -> None:
-        """Drop the text of a beacon that is lost."""
-        self._growing.pop(track_id, None)
-        self._changed.pop(track_id, None)
+    def keep(self, track_ids: Collection[int]) -> None:
+        """Drop the texts of all other beacons: they are lost."""
+        for texts in (self._growing, self._changed):
+            for track_id in [track_id for track_id in texts if track_id not in track_ids]:
+                del texts[track_id]
 
     def _text(self, track_id: int) -> BeaconText:
         text = self._growing[track_id]
