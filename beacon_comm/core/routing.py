@@ -77,14 +77,9 @@ class RoutedEvents(Mapping[int, Routed]):
         """Return what was routed in some parts of a hop interval, one after the other; at least one."""
         if len(parts) == 1:
             return parts[0]
-        owner = np.concatenate([part._owners() for part in parts])
-        order = np.argsort(owner, kind='stable')
-        t_ns = np.concatenate([part._t_ns for part in parts])[order]
-        polarity = np.concatenate([part._polarity for part in parts])[order]
-        return cls(parts[0]._place, t_ns, polarity, np.sum([part._stops for part in parts], axis=0))
-
-    def _owners(self) -> NDArray[np.uint16]:
-        return np.repeat(np.arange(len(self._stops), dtype=np.uint16), np.diff(self._stops, prepend=0))
+        t_ns = np.concatenate([part._t_ns for part in parts])
+        polarity = np.concatenate([part._polarity for part in parts])
+        return cls(parts[0]._place, *_join(np.array([part._stops for part in parts]), t_ns, polarity))
 
     @property
     def count(self) -> int:
@@ -310,3 +305,24 @@ def _sort(index, owner, t_ns, polarity, end, sorted_t_ns, sorted_polarity):  # t
         end[owner[i]] = at + 1
         sorted_t_ns[at] = t_ns[index[i]]
         sorted_polarity[at] = polarity[index[i]]
+
+
+@njit(cache=True, nogil=True)
+def _join(stops, t_ns, polarity):  # type: ignore[no-untyped-def]
+    """Return the events of some parts, each sorted by track, all sorted by track, and where each track's end.
+
+    ``stops``: of each part and track, ``(parts, tracks)``.
+    """
+    sorted_t_ns, sorted_polarity = np.empty_like(t_ns), np.empty_like(polarity)
+    ends = np.empty(stops.shape[1], np.int64)
+    at = np.uint64(0)  # unsigned, so that no place is taken to count from the end
+    for k in range(stops.shape[1]):
+        before = 0  # events of the parts before
+        for part in range(len(stops)):
+            start = stops[part, k - 1] if k else 0
+            for i in range(np.uint64(before + start), np.uint64(before + stops[part, k])):
+                sorted_t_ns[at], sorted_polarity[at] = t_ns[i], polarity[i]
+                at += np.uint64(1)
+            before += stops[part, -1]
+        ends[k] = at
+    return sorted_t_ns, sorted_polarity, ends
