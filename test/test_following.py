@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from disc_events import HOP_NS, T0_NS, batch, detect, merged, noise
+from disc_events import HOP_NS, T0_NS, batch, detect, hops, merged, noise
 from docs_script import load
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,6 +15,7 @@ from beacon_comm.core.detection import Detector
 from beacon_comm.core.events import EventBatch
 from beacon_comm.core.following import _doubted
 from beacon_comm.core.motion_tracks import MotionTrack
+from beacon_comm.core.nearest import cells_along, events_in
 from beacon_comm.core.parameters import Parameters
 
 SIZE = (320, 240)
@@ -77,6 +78,24 @@ def test_a_fast_blob_is_one_track_that_gets_its_events(path: Path, within_px: fl
     assert np.median(error) < within_px
     assert sum(len(part.t_ns) for part in routed[1]) > 0.93 * 80_000
     assert detector.tracks[1].extent_px == pytest.approx(4.0, abs=1.0)
+
+
+@pytest.mark.parametrize('speed', [0.0, 2000.0])
+def test_what_is_listed_near_tracks_is_all_that_lies_there(speed: float) -> None:
+    detector = Detector(Parameters(bit_rates=(1000.0,), tracker='motion'), SIZE)
+    across, near = cells_along(SIZE[0]), 0
+    for part in hops(merged(along(bouncing(speed), 0.0, 0.5), noise(*SIZE, 300_000, 0.5))):
+        followed = bool(detector.tracks)
+        for cut in (slice(0, 700), slice(700, 701), slice(701, len(part))):
+            detector.route(part.slice(cut.start, cut.stop, part.t_end_ns))
+        detector.hop(part.t_end_ns)
+        newest, grid = detector._images.newest, detector._images.grid
+        assert bool(newest.near_cells.any()) == followed
+        there = events_in(newest.near_cells, across, newest.code, grid.shift)
+        assert (np.diff(newest.near.astype(np.int64)) > 0).all() and np.isin(there, newest.near).all()
+        assert speed or len(there) == len(newest.near)  # else there may be others, where no track was any more
+        near += len(there)
+    assert near > 500
 
 
 def test_the_papers_tracker_breaks_it_up() -> None:

@@ -156,8 +156,9 @@ class BlobFinder:
         """
         p = self._parameters
         seen = _observe(
-            window, sums, self._length, newest.code, newest.offset_ns, (self._grid.width, self._grid.height, self._grid.shift),
-            p.routing_extent_factor, p.routing_margin_px, self._hop_ns, self.owner,
+            window, sums, self._length, newest.code, newest.offset_ns, newest.near, newest.near_cells,
+            (self._grid.width, self._grid.height, self._grid.shift), p.routing_extent_factor, p.routing_margin_px, self._hop_ns,
+            self.owner,
         )  # fmt: skip
         return [
             Blob(x, y, t_hop_ns - int(ago_ns), extent, i, of[COUNT], of[AREA], int(n), fresh > 0.0, w)
@@ -211,7 +212,9 @@ def _centre_and_extent(n, sum_x, sum_y, sum_rr):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _observe(window, sums, length, code, offset_ns, grid, factor, margin, hop_ns, owner):  # type: ignore[no-untyped-def]
+def _observe(  # type: ignore[no-untyped-def]
+    window, sums, length, code, offset_ns, near, near_cells, grid, factor, margin, hop_ns, owner
+):
     """Return centre (px), time before the hop's end (ns), extent (px), newest events, whether these are fresh: ``(m, 6)``."""
     seen, circle, box = np.empty((len(sums), 6)), np.empty((len(sums), 3)), np.empty((len(sums), 4))
     for b in range(len(sums)):
@@ -224,7 +227,9 @@ def _observe(window, sums, length, code, offset_ns, grid, factor, margin, hop_ns
     width, height, shift = grid
     across, down = cells_along(width), cells_along(height)
     first, member = list_cells(box, width, height, across, down)
-    newest = _sum_newest(code, offset_ns, shift, across, first, member, circle, owner)
+    wanted = cells_with_members(first)
+    events = near if _has_all(near_cells, wanted) else events_in(wanted, across, code, shift)
+    newest = _sum_newest(events, code, offset_ns, shift, across, first, member, circle, owner)
     for b in range(len(sums)):
         n, hops = newest[b, 0], length[window[b]]
         fresh = n >= max(FRESH_EVENTS, FRESH_SHARE * sums[b, COUNT] / hops)
@@ -274,10 +279,22 @@ def _long_stands(run, first, fits, short_label, short_fits, planes, used, shift)
 
 
 @njit(cache=True, nogil=True)
-def _sum_newest(code, offset_ns, shift, cells_across, first, member, circle, owner):  # type: ignore[no-untyped-def]
-    """Return n, Σx, Σy, Σ(x² + y²), Σ(t - hop's begin) of each blob's newest events, ``(m, 5)`` int64."""
+def _has_all(cells, wanted):  # type: ignore[no-untyped-def]
+    """Return whether all cells that are wanted are among these."""
+    missing = np.uint8(len(cells) < len(wanted))
+    for cell in range(min(len(cells), len(wanted))):
+        missing |= wanted[cell] & ~cells[cell]
+    return missing == 0
+
+
+@njit(cache=True, nogil=True)
+def _sum_newest(events, code, offset_ns, shift, cells_across, first, member, circle, owner):  # type: ignore[no-untyped-def]
+    """Return n, Σx, Σy, Σ(x² + y²), Σ(t - hop's begin) of each blob's newest events, ``(m, 5)`` int64.
+
+    ``events``: all that lie in cells with members, and perhaps others.
+    """
     sums = np.zeros((len(circle), 5), np.int64)
-    for event in events_in(cells_with_members(first), cells_across, code, shift):
+    for event in events:
         p = np.int64(code[event] >> np.uint32(CODE_BITS))
         y = p >> shift
         x = p - (y << shift)

@@ -117,6 +117,7 @@ class FollowingRouter(Router):
         self._step_ns = max(1, -(-round(parameters.hop_s * NS_PER_S) // STEPS))
         self._hidden = False
         self._settled = True
+        self._listed = np.empty(0, np.uint32)
         super().__init__(parameters, sensor_size)
 
     def aim(self, tracks: Sequence[Track], t_hop_ns: int) -> None:
@@ -135,13 +136,18 @@ class FollowingRouter(Router):
         self._step = np.full(1, _NO_STEP)
         self._hidden = bool((self._state[:, HIDDEN] > 0).any())
         self._first, self._member = np.empty(0, np.int64), np.empty(0, np.int32)
+        self._near_count = np.zeros(1, np.int64)
+        self._near_cells = np.full(cells_along(self._grid.width) * cells_along(self._grid.height), bool(followed), np.uint8)
 
     def _find_owners(self, segment: EventBatch, code: NDArray[np.uint32], count: NDArray[np.int64]) -> int:
         width, height = self._grid.width, self._grid.height
+        if len(self._listed) < len(self._code):
+            self._listed = np.concatenate((self._listed, np.empty(len(self._code) - len(self._listed), np.uint32)))
         routed, self._first, self._member = _follow(
             segment.x, segment.y, segment.polarity, segment.t_ns, self._t_hop_ns, self._step_ns, self._step,
             self._state, self._path, self._rank, self._partner, self._first, self._member, width, height,
             self._factor, self._margin, self._index, self._owner, code, count,
+            self.gathered, self._listed, self._near_count, self._near_cells,
         )  # fmt: skip
         self._settled = False
         return int(routed)
@@ -159,6 +165,9 @@ class FollowingRouter(Router):
         self.settle()
         return super().close()
 
+    def _near(self) -> tuple[NDArray[np.uint32], NDArray[np.uint8]]:
+        return self._listed[: self._near_count[0]].copy(), self._near_cells
+
     def settle(self) -> None:
         """Tell the tracks what the events since the last hop say about them."""
         if self._settled:
@@ -172,12 +181,16 @@ class FollowingRouter(Router):
 @njit(cache=True, nogil=True)
 def _follow(  # type: ignore[no-untyped-def]
     x, y, polarity, t_ns, t_hop_ns, step_ns, step, state, path, rank, partner, first, member, width, height, factor, margin,
-    index, owner, code, count,
+    index, owner, code, count, gathered, listed, near_count, near_cells,
 ):  # fmt: skip
-    """List the events that are of a track, with their tracks; move the tracks on; return how many, and the cells' lists."""
+    """List the events that are of a track, with their tracks; move the tracks on; return how many, and the cells' lists.
+
+    ``listed``, ``near_count``, ``near_cells``: for :class:`HopEvents`; ``gathered``: events of the hop before these.
+    """
     across, down = cells_along(width), cells_along(height)
     step_s = step_ns * 1e-9
     has_path = cells_with_members(first)
+    at = np.uint64(near_count[0])
     routed = np.int64(0)
     i = np.int64(0)
     while i < len(x):
@@ -193,6 +206,7 @@ def _follow(  # type: ignore[no-untyped-def]
             if not fits:
                 first, member = _list_paths(path, step_s, width, height, across, down)
                 has_path = cells_with_members(first)
+                near_cells &= has_path
         stop = i + np.searchsorted(t_ns[i:], t_hop_ns + (now + 1) * step_ns)
         base = routed
         near = np.uint64(base)  # unsigned, so that no place is taken to count from the end
@@ -202,6 +216,8 @@ def _follow(  # type: ignore[no-untyped-def]
         i = stop
         for j in range(np.uint64(base), near):
             e = np.uint64(index[j])
+            listed[at] = gathered + e
+            at += np.uint64(1)
             cell = cell_of(x[e], y[e], across)
             t_s = (t_ns[e] - t_hop_ns) * 1e-9
             ex, ey, dt = np.float64(x[e]), np.float64(y[e]), t_s - begin_s
@@ -246,9 +262,22 @@ def _follow(  # type: ignore[no-untyped-def]
             if not fits:
                 first, member = _list_paths(path, step_s, width, height, across, down)
                 has_path = cells_with_members(first)
+                near_cells &= has_path
                 i = np.int64(e) + 1  # what is near is another question now
                 break
+    near_count[0] = _list_shown(code, gathered, listed, near_count[0], at)
     return routed, first, member
+
+
+@njit(cache=True, nogil=True)
+def _list_shown(code, gathered, listed, start, stop):  # type: ignore[no-untyped-def]
+    """Close up the listed places from ``start`` to ``stop`` as hidden events go; return where they end."""
+    to = np.uint64(start)
+    for k in range(np.uint64(start), np.uint64(stop)):
+        if code[np.uint64(listed[k] - gathered)] != _HIDDEN:
+            listed[to] = listed[k] - (k - to)
+            to += np.uint64(1)
+    return to
 
 
 @njit(cache=True, nogil=True)

@@ -88,6 +88,8 @@ class HopEvents:
         planes: bits of their pixels' counts, ``(k,)`` uint64; see the module's head.
         t_start_ns: the hop's begin (ns, sensor clock).
         room: events that there is room for where ``code`` and ``offset_ns`` stand.
+        near: places in ``code`` of some events, among them all that lie in ``near_cells``, ``(k,)`` uint32, ascending.
+        near_cells: whether each cell of :mod:`beacon_comm.core.nearest` is one of these, ``(cells,)`` uint8; empty: none is.
     """
 
     code: NDArray[np.uint32]
@@ -97,6 +99,8 @@ class HopEvents:
     planes: NDArray[np.uint64]
     t_start_ns: int
     room: int
+    near: NDArray[np.uint32]
+    near_cells: NDArray[np.uint8]
 
     def __len__(self) -> int:
         return len(self.code)
@@ -105,13 +109,15 @@ class HopEvents:
     def size_bytes(self) -> int:
         """What it takes; nothing without events."""
         counts = self.rows.nbytes + self.first.nbytes + self.planes.nbytes
-        return counts + self.room * (self.code.itemsize + self.offset_ns.itemsize) if len(self) else 0
+        near = self.near.nbytes + self.near_cells.nbytes
+        return counts + near + self.room * (self.code.itemsize + self.offset_ns.itemsize) if len(self) else 0
 
 
 def no_events() -> HopEvents:
     """Return a hop without events."""
     none = np.empty(0, np.uint32)
-    return HopEvents(none, none, np.empty(0, np.int64), np.zeros(1, np.int64), np.empty(0, np.uint64), 0, 0)
+    counts = np.empty(0, np.int64), np.zeros(1, np.int64), np.empty(0, np.uint64)
+    return HopEvents(none, none, *counts, 0, 0, none, np.empty(0, np.uint8))
 
 
 def empty_planes(grid: PixelGrid, planes: int) -> NDArray[np.uint64]:

@@ -227,7 +227,11 @@ class Router:
             code, offset_ns, room = code.copy(), offset_ns.copy(), n
         else:
             self._code, self._offset_ns = np.empty_like(self._code), np.empty_like(self._offset_ns)
-        return HopEvents(code, offset_ns, *self._counts.take(), self._t_hop_ns, room)
+        return HopEvents(code, offset_ns, *self._counts.take(), self._t_hop_ns, room, *self._near())
+
+    def _near(self) -> tuple[NDArray[np.uint32], NDArray[np.uint8]]:
+        """Return the hop's events that lie near tracks, and where that is; see :class:`HopEvents`."""
+        return np.empty(0, np.uint32), np.empty(0, np.uint8)
 
     def _make_room(self, n: int) -> None:
         room = math.ceil(_MORE_ROOM * (self._gathered + n))
