@@ -14,6 +14,7 @@ from beacon_comm.core import motion
 from beacon_comm.core.detection import Detector
 from beacon_comm.core.events import EventBatch
 from beacon_comm.core.following import _doubted
+from beacon_comm.core.hop_events import CODE_BITS
 from beacon_comm.core.motion_tracks import MotionTrack
 from beacon_comm.core.nearest import cells_along, events_in
 from beacon_comm.core.parameters import Parameters
@@ -91,9 +92,12 @@ def test_what_is_listed_near_tracks_is_all_that_lies_there(speed: float) -> None
         detector.hop(part.t_end_ns)
         newest, grid = detector._images.newest, detector._images.grid
         assert bool(newest.near_cells.any()) == followed
+        near_code, near_offset_ns = newest.near
         there = events_in(newest.near_cells, across, newest.code, grid.shift)
-        assert (np.diff(newest.near.astype(np.int64)) > 0).all() and np.isin(there, newest.near).all()
-        assert speed or len(there) == len(newest.near)  # else there may be others, where no track was any more
+        listed = events_in(newest.near_cells, across, near_code, grid.shift)
+        assert np.array_equal(near_code[listed] >> CODE_BITS, newest.code[there] >> CODE_BITS)
+        assert np.array_equal(near_offset_ns[listed], newest.offset_ns[there])
+        assert speed or len(listed) == len(near_code)  # else there may be others, where no track was any more
         near += len(there)
     assert near > 500
 

@@ -228,8 +228,12 @@ def _observe(  # type: ignore[no-untyped-def]
     across, down = cells_along(width), cells_along(height)
     first, member = list_cells(box, width, height, across, down)
     wanted = cells_with_members(first)
-    events = near if _has_all(near_cells, wanted) else events_in(wanted, across, code, shift)
-    newest = _sum_newest(events, code, offset_ns, shift, across, first, member, circle, owner)
+    if _has_all(near_cells, wanted):
+        code, offset_ns = near[0], near[1]
+    else:
+        events = events_in(wanted, across, code, shift)
+        code, offset_ns = code[events], offset_ns[events]
+    newest = _sum_newest(code, offset_ns, shift, across, first, member, circle, owner)
     for b in range(len(sums)):
         n, hops = newest[b, 0], length[window[b]]
         fresh = n >= max(FRESH_EVENTS, FRESH_SHARE * sums[b, COUNT] / hops)
@@ -288,13 +292,13 @@ def _has_all(cells, wanted):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _sum_newest(events, code, offset_ns, shift, cells_across, first, member, circle, owner):  # type: ignore[no-untyped-def]
+def _sum_newest(code, offset_ns, shift, cells_across, first, member, circle, owner):  # type: ignore[no-untyped-def]
     """Return n, Σx, Σy, Σ(x² + y²), Σ(t - hop's begin) of each blob's newest events, ``(m, 5)`` int64.
 
-    ``events``: all that lie in cells with members, and perhaps others.
+    The events: all that lie in cells with members, and perhaps others.
     """
     sums = np.zeros((len(circle), 5), np.int64)
-    for event in events:
+    for event in range(len(code)):
         p = np.int64(code[event] >> np.uint32(CODE_BITS))
         y = p >> shift
         x = p - (y << shift)

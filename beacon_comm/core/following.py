@@ -117,7 +117,7 @@ class FollowingRouter(Router):
         self._step_ns = max(1, -(-round(parameters.hop_s * NS_PER_S) // STEPS))
         self._hidden = False
         self._settled = True
-        self._listed = np.empty(0, np.uint32)
+        self._listed = np.empty((2, 0), np.uint32)
         super().__init__(parameters, sensor_size)
 
     def aim(self, tracks: Sequence[Track], t_hop_ns: int) -> None:
@@ -141,13 +141,14 @@ class FollowingRouter(Router):
 
     def _find_owners(self, segment: EventBatch, code: NDArray[np.uint32], count: NDArray[np.int64]) -> int:
         width, height = self._grid.width, self._grid.height
-        if len(self._listed) < len(self._code):
-            self._listed = np.concatenate((self._listed, np.empty(len(self._code) - len(self._listed), np.uint32)))
+        more = len(self._code) - self._listed.shape[1]
+        if more > 0:
+            self._listed = np.concatenate((self._listed, np.empty((2, more), np.uint32)), axis=1)
         routed, self._first, self._member = _follow(
             segment.x, segment.y, segment.polarity, segment.t_ns, self._t_hop_ns, self._step_ns, self._step,
             self._state, self._path, self._rank, self._partner, self._first, self._member, width, height,
             self._factor, self._margin, self._index, self._owner, code, count,
-            self.gathered, self._listed, self._near_count, self._near_cells,
+            self._listed, self._near_count, self._near_cells,
         )  # fmt: skip
         self._settled = False
         return int(routed)
@@ -166,7 +167,7 @@ class FollowingRouter(Router):
         return super().close()
 
     def _near(self) -> tuple[NDArray[np.uint32], NDArray[np.uint8]]:
-        return self._listed[: self._near_count[0]].copy(), self._near_cells
+        return self._listed[:, : self._near_count[0]].copy(), self._near_cells
 
     def settle(self) -> None:
         """Tell the tracks what the events since the last hop say about them."""
@@ -181,11 +182,11 @@ class FollowingRouter(Router):
 @njit(cache=True, nogil=True)
 def _follow(  # type: ignore[no-untyped-def]
     x, y, polarity, t_ns, t_hop_ns, step_ns, step, state, path, rank, partner, first, member, width, height, factor, margin,
-    index, owner, code, count, gathered, listed, near_count, near_cells,
+    index, owner, code, count, listed, near_count, near_cells,
 ):  # fmt: skip
     """List the events that are of a track, with their tracks; move the tracks on; return how many, and the cells' lists.
 
-    ``listed``, ``near_count``, ``near_cells``: for :class:`HopEvents`; ``gathered``: events of the hop before these.
+    ``listed``, ``near_count``, ``near_cells``: for :class:`HopEvents`.
     """
     across, down = cells_along(width), cells_along(height)
     step_s = step_ns * 1e-9
@@ -216,7 +217,7 @@ def _follow(  # type: ignore[no-untyped-def]
         i = stop
         for j in range(np.uint64(base), near):
             e = np.uint64(index[j])
-            listed[at] = gathered + e
+            listed[0, at], listed[1, at] = code[e], t_ns[e] - t_hop_ns
             at += np.uint64(1)
             cell = cell_of(x[e], y[e], across)
             t_s = (t_ns[e] - t_hop_ns) * 1e-9
@@ -232,7 +233,11 @@ def _follow(  # type: ignore[no-untyped-def]
                     nearest2, best, highest, best_x, best_y = d2, one_of, rank[one_of], dx, dy
             if best < 0:
                 continue
-            code[e] = _HIDDEN if state[best, HIDDEN] > 0 else code[e] | np.uint32(ROUTED)
+            if state[best, HIDDEN] > 0:
+                code[e] = _HIDDEN
+                at -= np.uint64(1)
+            else:
+                code[e] |= np.uint32(ROUTED)
             index[routed] = e
             owner[routed] = best
             count[best] += 1
@@ -265,19 +270,8 @@ def _follow(  # type: ignore[no-untyped-def]
                 near_cells &= has_path
                 i = np.int64(e) + 1  # what is near is another question now
                 break
-    near_count[0] = _list_shown(code, gathered, listed, near_count[0], at)
+    near_count[0] = at
     return routed, first, member
-
-
-@njit(cache=True, nogil=True)
-def _list_shown(code, gathered, listed, start, stop):  # type: ignore[no-untyped-def]
-    """Close up the listed places from ``start`` to ``stop`` as hidden events go; return where they end."""
-    to = np.uint64(start)
-    for k in range(np.uint64(start), np.uint64(stop)):
-        if code[np.uint64(listed[k] - gathered)] != _HIDDEN:
-            listed[to] = listed[k] - (k - to)
-            to += np.uint64(1)
-    return to
 
 
 @njit(cache=True, nogil=True)

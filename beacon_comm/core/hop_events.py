@@ -88,7 +88,8 @@ class HopEvents:
         planes: bits of their pixels' counts, ``(k,)`` uint64; see the module's head.
         t_start_ns: the hop's begin (ns, sensor clock).
         room: events that there is room for where ``code`` and ``offset_ns`` stand.
-        near: places in ``code`` of some events, among them all that lie in ``near_cells``, ``(k,)`` uint32, ascending.
+        near: code and offset of some events, in order, among them all that lie in ``near_cells``, ``(2, k)`` uint32; codes
+            without flag.
         near_cells: whether each cell of :mod:`beacon_comm.core.nearest` is one of these, ``(cells,)`` uint8; empty: none is.
     """
 
@@ -113,11 +114,16 @@ class HopEvents:
         return counts + near + self.room * (self.code.itemsize + self.offset_ns.itemsize) if len(self) else 0
 
 
+def nothing_near() -> tuple[NDArray[np.uint32], NDArray[np.uint8]]:
+    """Return no events, of no cells."""
+    return np.empty((2, 0), np.uint32), np.empty(0, np.uint8)
+
+
 def no_events() -> HopEvents:
     """Return a hop without events."""
     none = np.empty(0, np.uint32)
     counts = np.empty(0, np.int64), np.zeros(1, np.int64), np.empty(0, np.uint64)
-    return HopEvents(none, none, *counts, 0, 0, none, np.empty(0, np.uint8))
+    return HopEvents(none, none, *counts, 0, 0, *nothing_near())
 
 
 def empty_planes(grid: PixelGrid, planes: int) -> NDArray[np.uint64]:

@@ -23,7 +23,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from beacon_comm.core.events import EventBatch
-from beacon_comm.core.hop_events import CODE_BITS, ROUTED, HopCounts, HopEvents, PixelGrid
+from beacon_comm.core.hop_events import CODE_BITS, ROUTED, HopCounts, HopEvents, PixelGrid, nothing_near
 from beacon_comm.core.index_image import hop_length_ns
 from beacon_comm.core.nearest import CELL_SHIFT, cell_lists, cells_along, cells_with_members
 from beacon_comm.core.parameters import Parameters
@@ -231,7 +231,7 @@ class Router:
 
     def _near(self) -> tuple[NDArray[np.uint32], NDArray[np.uint8]]:
         """Return the hop's events that lie near tracks, and where that is; see :class:`HopEvents`."""
-        return np.empty(0, np.uint32), np.empty(0, np.uint8)
+        return nothing_near()
 
     def _make_room(self, n: int) -> None:
         room = math.ceil(_MORE_ROOM * (self._gathered + n))
