@@ -339,7 +339,7 @@ def draw(metrics: MetricTable, path: Path) -> None:
     right.minorticks_off()
     for axes in (left, right):
         axes.set_ylim(0, None)
-        axes.legend(fontsize=7)
+        axes.legend(fontsize=7, handlelength=4)
         axes.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
     plt.close(figure)

@@ -150,7 +150,7 @@ class Parameters(Declared):
     )
     rate_search: str = parameter(
         'both',
-        'sequence: look for the listed bit rates, for any from 100 bps to 10 kbps (blind), or first for the listed ones',
+        'sequence: look for the listed bit rates, for any from 100 bps to 10 kbps (blind), or side by side for both',
         choices=('both', 'listed', 'blind'),
     )
     search_load: float = parameter(
