@@ -17,7 +17,7 @@ and polarity at most: one with more of both than that in a hop has the index of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -108,10 +108,14 @@ class HopEvents:
 
     @property
     def size_bytes(self) -> int:
-        """What it takes; nothing without events."""
+        """What it takes without what is near; nothing without events."""
         counts = self.rows.nbytes + self.first.nbytes + self.planes.nbytes
-        near = self.near.nbytes + self.near_cells.nbytes
-        return counts + near + self.room * (self.code.itemsize + self.offset_ns.itemsize) if len(self) else 0
+        return counts + self.room * (self.code.itemsize + self.offset_ns.itemsize) if len(self) else 0
+
+    def alone(self) -> HopEvents:
+        """Return it without what is near: that is for the newest hop's blobs alone."""
+        near, near_cells = nothing_near()
+        return replace(self, near=near, near_cells=near_cells)
 
 
 def nothing_near() -> tuple[NDArray[np.uint32], NDArray[np.uint8]]:
