@@ -147,10 +147,12 @@ def test_a_text_keeps_its_last_codes_and_counts_all() -> None:
 def test_a_lost_beacons_text_is_dropped() -> None:
     texts = Texts(kept=4)
     texts.add(character())
+    texts.add(character(track_id=8))
     texts.keep([8])
-    assert texts.take_changed() == []
-    texts.add(character())
-    assert texts.take_changed()[0].first_index == 0
+    assert [text.track_id for text in texts.take_changed()] == [8]
+    for track_id in (7, 8):
+        texts.add(character(track_id=track_id))
+    assert [(text.track_id, len(text.codes)) for text in texts.take_changed()] == [(7, 1), (8, 2)]
 
 
 # --- silence ---

@@ -22,7 +22,7 @@ are neither given out nor counted, whatever a demodulator made of the hole.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
@@ -35,7 +35,7 @@ from beacon_comm.core.confirmation import ParityRecord
 from beacon_comm.core.demodulator import Demodulator, GapAware, Recognising, Searching
 from beacon_comm.core.event_buffer import buffer_length_ns
 from beacon_comm.core.events import NS_PER_S
-from beacon_comm.core.last_looks import LONGEST_WAIT_NS, LastLooks
+from beacon_comm.core.last_looks import WEIGHT, LastLooks
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.routing import Routed, RoutedEvents
 from beacon_comm.core.signature import Signature
@@ -43,6 +43,9 @@ from beacon_comm.core.tracks import Track
 
 UNSETTLED_BITS = 1.0
 """An edge so close behind a gap (bit) may be the gap's end, and not the line's."""
+
+_GAPS_KEPT_NS = 60 * NS_PER_S
+"""Gaps are remembered for so long, or for ten buffers: a beacon that is found late is read from far back on."""
 
 Times = NDArray[np.int64]
 Polarities = NDArray[np.int8]
@@ -130,10 +133,10 @@ class _Slot:
         if isinstance(self.demodulator, GapAware):
             self.demodulator.miss(start_ns, stop_ns)
 
-    def ending(self, track_id: int) -> Iterator[list[ReceivedCharacter]]:
+    def ending(self, track_id: int) -> Iterator[list[ReceivedCharacter] | float]:
         demodulator = self.demodulator
         for part in demodulator.ending() if isinstance(demodulator, Searching) else [demodulator.flush()]:
-            yield self.judge(track_id, part)
+            yield part if isinstance(part, float) else self.judge(track_id, part)
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +168,7 @@ class CandidateSlots:
         self._slots: dict[int, _Slot] = {}
         self._tried: dict[int, _Tried] = {}
         self._slots_full = False
-        self._gaps = Gaps(2 * buffer_length_ns(parameters) + LONGEST_WAIT_NS)
+        self._gaps = Gaps(max(_GAPS_KEPT_NS, 10 * buffer_length_ns(parameters)) + round(parameters.lost_after_s * NS_PER_S))
         self._last_looks = LastLooks[ReceivedCharacter](parameters.hop_s)
         self.search_share = 1.0
 
@@ -208,7 +211,7 @@ class CandidateSlots:
             given = queue[: self._free]
         search_load = self._share_search_load(len(given), t_ns)
         self._slots_full = len(queue) > len(given)
-        received = self._last_looks.work(self.search_share * self._p.search_load, t_ns)
+        received = self._last_looks.work(WEIGHT * search_load, t_ns)
         for track_id in given:
             received += self._give(track_id, t_ns, search_load, *backlog(track_id))
         for track_id, track in tracks.items():
@@ -244,6 +247,15 @@ class CandidateSlots:
         slot = self._slots.pop(track_id, None)
         return [] if slot is None else self._last_looks.begin(track_id, slot.ending(track_id), t_ns)
 
+    def end(self, track_ids: Iterable[int]) -> list[ReceivedCharacter]:
+        """Drop tracks because the stream ends; return the last characters of theirs, and of those lost before."""
+        received = self._last_looks.finish_all()
+        for track_id in track_ids:
+            self._tried.pop(track_id, None)
+            slot = self._slots.pop(track_id, None)
+            received += [] if slot is None else slot.judge(track_id, slot.demodulator.flush())
+        return received
+
     def flush(self) -> list[ReceivedCharacter]:
         """Return the last characters of all demodulators, and of lost tracks', at the end of a stream, in order of time."""
         received = self._last_looks.finish_all()
@@ -252,9 +264,9 @@ class CandidateSlots:
         return sorted(received, key=_by_time)
 
     @property
-    def looking_back(self) -> bool:
-        """Lost tracks are still looked at; as of the last hop."""
-        return bool(self._last_looks)
+    def looked_back_at(self) -> Collection[int]:
+        """Labels of lost tracks that are looked at for the last time; as of the last hop."""
+        return self._last_looks.track_ids
 
     @property
     def slots_full(self) -> bool:
@@ -344,7 +356,8 @@ class CandidateSlots:
             for slot in self._slots.values()
             if isinstance(slot.demodulator, Searching) and slot.demodulator.bit_rate_bps is None
         ]
-        load = self.search_share * self._p.search_load / max(1, len(searching) + more)
+        shares = len(searching) + more + (WEIGHT if self._last_looks.track_ids else 0)
+        load = self.search_share * self._p.search_load / max(1, shares)
         for demodulator in searching:
             demodulator.share(load, t_ns)
         return load

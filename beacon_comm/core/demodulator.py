@@ -88,8 +88,8 @@ class Searching(Protocol):
         """Hear, before the first events, that those before ``to_ns`` (ns) have been searched: read them, if need be."""
         ...
 
-    def ending(self) -> Iterator[list[Character]]:
-        """Flush in parts: characters as soon as they are there, and an empty part for each piece of a look, of some 0.2 ms."""
+    def ending(self) -> Iterator[list[Character] | float]:
+        """Flush in parts: characters as soon as they are there, and of each piece of a look what it has cost, nominally (s)."""
         ...
 
 

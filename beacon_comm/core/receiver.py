@@ -89,7 +89,7 @@ class Output(NamedTuple):
     Attributes:
         characters: decoded characters, those of each track in order of time; the order between tracks depends on
             the batches.
-        lost: last snapshots of the tracks that were lost.
+        lost: last snapshots of the tracks that were lost; a few characters of theirs may come later, by some seconds.
         confirmed_changed: the set of confirmed beacons is another one than before.
     """
 
@@ -211,8 +211,8 @@ class Receiver:
 
     @property
     def track_ids(self) -> Collection[int]:
-        """Labels of all tracks."""
-        return self._detection.tracks.keys()
+        """Labels of all tracks, and of the lost ones that characters may still come from."""
+        return {*self._detection.tracks, *self._slots.looked_back_at}
 
     @property
     def slots_full(self) -> bool:
@@ -237,7 +237,7 @@ class Receiver:
             self._t_ns = int(batch.t_ns[0]) if len(batch) else batch.t_end_ns
         start = 0
         while (t_hop := (self._t_ns // hop + 1) * hop) <= batch.t_end_ns:
-            if self._detection.idle and not self._slots.looking_back:  # nothing can change at the points before the next event
+            if self._detection.idle and not self._slots.looked_back_at:  # nothing can change before the next event
                 next_ns = int(batch.t_ns[start]) if start < len(batch) else batch.t_end_ns
                 t_hop = max(t_hop, next_ns // hop * hop)
             stop = int(np.searchsorted(batch.t_ns, t_hop, side='left'))
@@ -282,10 +282,8 @@ class Receiver:
         self._settled_ns = {}
         if self._meetings is not None:
             self._meetings.clear()
-        characters: list[ReceivedCharacter] = []
-        lost: list[BeaconSnapshot] = []
-        self._lose(changes, characters, lost)
-        return self._output(characters + self._slots.flush(), lost)
+        lost = [self._snapshot(track, self._t_ns or 0, BeaconState.LOST) for track in changes.lost]
+        return self._output(self._slots.end(track.track_id for track in changes.lost), lost)
 
     def _output(self, characters: list[ReceivedCharacter], lost: list[BeaconSnapshot]) -> Output:
         confirmed = self._slots.confirmed

@@ -24,8 +24,10 @@ from beacon_comm.core.character import Character, Status
 from beacon_comm.core.event_buffer import EVENT_BYTES, EventArrays
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.framing import CharacterFrame
+from beacon_comm.core.last_looks import all_of
 from beacon_comm.core.likelihood import MEMORY_BITS
 from beacon_comm.core.parameters import Parameters
+from beacon_comm.core.search_pace import PASS_COST_S, PIECE_COST_S
 from beacon_comm.core.searcher import Found, RateSearcher
 from beacon_comm.core.sequence_detection import (
     BORDER_OF_START,
@@ -198,20 +200,20 @@ class SequenceDemodulator:
 
     def flush(self) -> list[Character]:
         """End the stream; see :class:`beacon_comm.core.demodulator.Demodulator`."""
-        return [character for part in self.ending() for character in part]
+        return all_of(self.ending())
 
-    def ending(self) -> Iterator[list[Character]]:
+    def ending(self) -> Iterator[list[Character] | float]:
         """End the stream in parts; see :class:`beacon_comm.core.demodulator.Searching`."""
         while True:
             if self._lock is None and len(self._t):
+                piece_s = PIECE_COST_S + PASS_COST_S * len(self._events)
                 for _ in self._search_the_last():
-                    yield []
+                    yield piece_s
             lock = self._lock
             if lock is None:
                 return
             status, read = self._follow(lock, self._known_to)
-            if read:
-                yield read
+            yield read
             if status == STILL_LOCKED:
                 break
             if status != FULL:
@@ -220,8 +222,7 @@ class SequenceDemodulator:
         characters = self._characters(self._rows[:count])
         self._unlock(reread=True)
         self._ended = lock
-        if characters:
-            yield characters
+        yield characters
 
     # Locked
 

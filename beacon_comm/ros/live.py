@@ -105,7 +105,7 @@ class LiveReceiver:
 
     @property
     def track_ids(self) -> Collection[int]:
-        """Labels of all tracks."""
+        """Labels of all tracks, and of the lost ones that characters may still come from."""
         return () if self._receiver is None else self._receiver.track_ids
 
     @property
