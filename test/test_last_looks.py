@@ -164,6 +164,7 @@ def test_a_restart_reads_all_that_it_loses_at_once() -> None:
     lost = Lost(noises=MOST_WAITING + 2, slots=MOST_WAITING + 3)
     lost.received += lost.slots.end(list(lost.tracks))
     assert lost.read(MOST_WAITING + 2) == lost.text and not lost.slots.looked_back_at
+    assert lost.slots.passed_over == 0
 
 
 def short_message() -> tuple[np.ndarray, np.ndarray]:

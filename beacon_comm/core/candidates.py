@@ -269,6 +269,11 @@ class CandidateSlots:
         return self._last_looks.track_ids
 
     @property
+    def passed_over(self) -> int:
+        """How many lost tracks were not looked at for the last time: too many were lost."""
+        return self._last_looks.passed_over
+
+    @property
     def slots_full(self) -> bool:
         """Candidates with events wait because every slot is taken; as of the last hop."""
         return self._slots_full

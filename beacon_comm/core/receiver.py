@@ -215,6 +215,11 @@ class Receiver:
         return {*self._detection.tracks, *self._slots.looked_back_at}
 
     @property
+    def passed_over(self) -> int:
+        """How many lost tracks were not looked at for the last time: too many were lost."""
+        return self._slots.passed_over
+
+    @property
     def slots_full(self) -> bool:
         """Whether candidates wait because every slot is taken."""
         return self._slots.slots_full

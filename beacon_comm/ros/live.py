@@ -96,6 +96,8 @@ class LiveReceiver:
         if self._stream is not None:
             counts.update(self._stream.counts)
         counts['late_packets'] = self._time.late_packets
+        if self._receiver is not None:
+            counts['passed_over_candidates'] = self._receiver.passed_over
         return counts
 
     @property
