@@ -162,7 +162,7 @@ def test_the_streams_end_reads_what_still_waits() -> None:
 
 def test_a_restart_reads_all_that_it_loses_at_once() -> None:
     lost = Lost(noises=MOST_WAITING + 2, slots=MOST_WAITING + 3)
-    lost.received += lost.slots.end(list(lost.tracks))
+    lost.received += lost.slots.end()
     assert lost.read(MOST_WAITING + 2) == lost.text and not lost.slots.looked_back_at
     assert lost.slots.passed_over == 0
 

@@ -22,7 +22,7 @@ are neither given out nor counted, whatever a demodulator made of the hole.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
@@ -247,13 +247,11 @@ class CandidateSlots:
         slot = self._slots.pop(track_id, None)
         return [] if slot is None else self._last_looks.begin(track_id, slot.ending(track_id), t_ns)
 
-    def end(self, track_ids: Iterable[int]) -> list[ReceivedCharacter]:
-        """Drop tracks because the stream ends; return the last characters of theirs, and of those lost before."""
-        received = self._last_looks.finish_all()
-        for track_id in track_ids:
-            self._tried.pop(track_id, None)
-            slot = self._slots.pop(track_id, None)
-            received += [] if slot is None else slot.judge(track_id, slot.demodulator.flush())
+    def end(self) -> list[ReceivedCharacter]:
+        """Drop all tracks because the stream ends and another begins; return their last characters, as :meth:`flush` does."""
+        received = self.flush()
+        self._slots.clear()
+        self._tried.clear()
         return received
 
     def flush(self) -> list[ReceivedCharacter]:

@@ -288,7 +288,7 @@ class Receiver:
         if self._meetings is not None:
             self._meetings.clear()
         lost = [self._snapshot(track, self._t_ns or 0, BeaconState.LOST) for track in changes.lost]
-        return self._output(self._slots.end(track.track_id for track in changes.lost), lost)
+        return self._output(self._slots.end(), lost)
 
     def _output(self, characters: list[ReceivedCharacter], lost: list[BeaconSnapshot]) -> Output:
         confirmed = self._slots.confirmed
