@@ -294,6 +294,19 @@ def test_edges_that_pass_do_not_take_a_beacon_along(seed: int) -> None:
     assert detector.tracks[1].position_at(T0_NS + 600_000_000) == pytest.approx((160.0, 120.0), abs=1.0)
 
 
+@pytest.mark.parametrize('bit_rates', [(1000.0,), (504.0, 3125.0)])
+def test_what_dense_noise_has_begun_is_lost_when_there_is_less_of_it(bit_rates: tuple[float, ...]) -> None:
+    size = (160, 120)
+    dense, thin = noise(*size, 45.0 * size[0] * size[1], 0.4), noise(*size, 11.0 * size[0] * size[1], 2.8, seed=10)
+    thin = batch(thin.x, thin.y, thin.polarity, thin.t_ns + 400_000_000)
+    detector = Detector(Parameters(bit_rates=bit_rates), size)
+    tracks = []
+    detect(detector, merged(dense, thin, along(still(80.0, 60.0), 0.0, 3.2)), lambda *_: tracks.append(len(detector.tracks)))
+    assert max(tracks[:50]) > 40
+    assert list(detector.tracks) == [1]
+    assert detector.tracks[1].position_at(T0_NS + 3_200_000_000) == pytest.approx((80.0, 60.0), abs=1.0)
+
+
 def test_lights_of_a_single_pixel_side_by_side_are_followed() -> None:
     """Their blobs have no extent, and their events may be of either."""
     t_ns = T0_NS + np.arange(0, 300_000_000, 200_000)

@@ -5,8 +5,9 @@
                 neither                            ──► quiet: predicted, and what comes within its circle moves it again
                 a fresh blob of no track           ──► a new track, or one that was lost near there (``reacquire_s``)
 
-The paper's index of a track is that of a pixel moved along: its events over its area in windows that forget like the
-detection's short and long one, so that a fast one has an index, too.
+The paper's index of a track is that of a pixel moved along: its events over the area that they are spread over, its own at
+least, in windows that forget like the detection's short and long one, so that a fast one has an index, too.  Where nothing is
+but noise, a circle is the larger the less is known of a track: over its own area alone, noise would keep it for ever.
 
 Edges that pass over a beacon may drag its track away.  One whose velocity has jumped remembers for a while where it was
 before (:class:`Steady`): if something is seen where it would be by now, and nobody else's, that is it.
@@ -479,13 +480,14 @@ def _evidence(rows, forget, offset):  # type: ignore[no-untyped-def]
     for i in range(len(rows)):
         row = rows[i]
         own = row[HOP_ON] + row[HOP_OFF]
-        area = np.pi * max(row[EXTENT], 1.0) ** 2
+        spread = np.sqrt(2.0 * row[HOP_RR] / max(own, 1.0))
+        area = np.pi * max(row[EXTENT], spread, 1.0) ** 2
         index = 0.0
         for k, on, off in ((0, SHORT_ON, SHORT_OFF), (1, LONG_ON, LONG_OFF)):
             row[on] = row[on] * forget[k] + row[HOP_ON]
             row[off] = row[off] * forget[k] + row[HOP_OFF]
             index = max(index, (row[on] + row[off]) / (offset * area + abs(row[on] - row[off])))
-        found[i, 0], found[i, 1], found[i, 2] = own, index, np.sqrt(2.0 * row[HOP_RR] / max(own, 1.0))
+        found[i, 0], found[i, 1], found[i, 2] = own, index, spread
     return found
 
 
