@@ -23,7 +23,7 @@ from beacon_comm.core.events import NS_PER_S
 BIT_COST_S, EVENT_COST_S = 25e-6, 30e-9
 """What it costs to look at a bit, and at an event, of a window (s of one core of a small computer)."""
 
-PIECE_COST_S, PASS_COST_S = 0.25e-3, 1.2e-9
+PIECE_COST_S, PASS_COST_S = 0.6e-3, 1.2e-9
 """What a piece of a look costs, of hundreds, and each event that it goes through."""
 
 BURST_S = 0.0025
