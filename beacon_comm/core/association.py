@@ -8,6 +8,7 @@ are matched at once; the assignment problem (Kuhn, 1955) is solved for each grou
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,18 +34,23 @@ def assign(
     if len(set(firsts)) == len(set(seconds)) == len(firsts):
         return list(zip(firsts, seconds, strict=True))
     cost = costs_of_all()
-    ends = np.concatenate((first, second + shape[0]))
     graph = coo_array((np.ones(len(first)), (first, second + shape[0])), shape=(sum(shape), sum(shape)))
     _, group = connected_components(graph, directed=False)
-    alone = np.bincount(group[ends], minlength=group.max() + 1)[group[first]] == 2
-    pairs = list(zip(first[alone].tolist(), second[alone].tolist(), strict=True))
-    for g in np.unique(group[first[~alone]]):
-        of = np.flatnonzero(group[first] == g)
-        rows, i = np.unique(first[of], return_inverse=True)
-        columns, j = np.unique(second[of], return_inverse=True)
-        costs = np.full((len(rows), len(columns)), _NO_PAIR)
-        costs[i, j] = cost[of]
-        for a, b in zip(*linear_sum_assignment(costs), strict=True):
-            if costs[a, b] < _NO_PAIR:
-                pairs.append((int(rows[a]), int(columns[b])))
-    return pairs
+    of = group[first]
+    order = np.argsort(of, kind='stable')
+    entries = zip(of[order].tolist(), first[order].tolist(), second[order].tolist(), cost[order].tolist(), strict=True)
+    return [pair for _, some in groupby(entries, key=lambda entry: entry[0]) for pair in _best([one[1:] for one in some])]
+
+
+def _best(pairs: list[tuple[int, int, float]]) -> list[tuple[int, int]]:
+    """Return the best assignment of a group, each of its pairs with its cost."""
+    rows, columns = ({label: k for k, label in enumerate(dict.fromkeys(pair[side] for pair in pairs))} for side in (0, 1))
+    if len(rows) == 1 or len(columns) == 1:
+        i, j, _ = min(pairs, key=lambda pair: pair[2])
+        return [(i, j)]
+    costs = np.full((len(rows), len(columns)), _NO_PAIR)
+    for i, j, cost in pairs:
+        costs[rows[i], columns[j]] = cost
+    firsts, seconds = list(rows), list(columns)
+    chosen = zip(*linear_sum_assignment(costs), strict=True)
+    return [(firsts[a], seconds[b]) for a, b in chosen if costs[a, b] < _NO_PAIR]
