@@ -197,7 +197,7 @@ class Detector:
     def _fill_buffers(self) -> None:
         """Hand the tracks' buffers what was routed since the last hop."""
         if self._routed:
-            for track_id, part in RoutedEvents.joined(self._routed).items():
+            for track_id, part in RoutedEvents.joined(self._routed).by_track():
                 self._buffers[track_id].append(part.t_ns, part.polarity)
             self._routed.clear()
 

@@ -126,10 +126,11 @@ class FollowingRouter(Router):
         self._tracks = followed
         self._place = places(tracks)
         self._t_hop_ns = t_hop_ns
-        self._state = np.empty((len(followed), motion.WIDTH))
-        for k, track in enumerate(followed):
-            self._state[k] = track.aimed(t_hop_ns)
-            track.row = self._state[k]
+        self._state = np.array([track.row for track in followed]).reshape(-1, motion.WIDTH)
+        later_s = np.array([(t_hop_ns - track.origin_ns) / NS_PER_S for track in followed])
+        motion.aim(self._state, later_s, np.array([track.extent_px for track in followed]))
+        for track, row in zip(followed, self._state, strict=True):
+            track.row, track.origin_ns = row, t_hop_ns
         self._path = np.zeros((len(followed), 10))
         self._rank = np.array([2 * (not track.quiet) + (track.bit_rate_bps is not None) for track in followed], np.int64)
         self._partner = np.full(len(followed), -1)

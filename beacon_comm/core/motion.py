@@ -103,6 +103,15 @@ def rebase(row, later_s):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def aim(rows, later_s, extent_px):  # type: ignore[no-untyped-def]
+    """Begin a hop that is later (s) than what each row counts times from, ``(n,)``: sums at zero, and the radii (px)."""
+    for k in range(len(rows)):
+        rebase(rows[k], later_s[k])
+        rows[k, HOP_OFF : HOP_RR + 1] = 0.0
+        rows[k, EXTENT] = extent_px[k]
+
+
+@njit(cache=True, nogil=True)
 def variance_at(row, dt_s):  # type: ignore[no-untyped-def]
     """Return the variance of position (px²), one axis, ``dt_s`` after the state's time."""
     return row[PP] + dt_s * (2.0 * row[PV] + dt_s * (row[VV] + row[NOISE] * dt_s / 3.0))

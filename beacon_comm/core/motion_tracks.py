@@ -141,14 +141,6 @@ class MotionTrack(Track):
     latency_s: float = 0.0
     steady: Steady | None = None
 
-    def aimed(self, t_hop_ns: int) -> NDArray[np.float64]:
-        """Return the row for the hop interval that begins at ``t_hop_ns`` (ns), with the hop's sums at zero."""
-        motion.rebase(self.row, (t_hop_ns - self.origin_ns) / NS_PER_S)
-        self.origin_ns = t_hop_ns
-        self.row[HOP_OFF : HOP_RR + 1] = 0.0
-        self.row[EXTENT] = self.extent_px
-        return self.row
-
     def settle(self) -> None:
         """Take the row's state over."""
         x, y, vx, vy, pp, pv, vv, noise = self.row[X : NOISE + 1].tolist()

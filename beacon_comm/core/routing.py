@@ -110,6 +110,14 @@ class RoutedEvents(Mapping[int, Routed]):
     def __len__(self) -> int:
         return int(np.count_nonzero(np.diff(self._stops, prepend=0)))
 
+    def by_track(self) -> Iterator[tuple[int, Routed]]:
+        """Yield what :meth:`items` does; that would look every label up."""
+        start = 0
+        for track_id, stop in zip(self._place, self._stops.tolist(), strict=True):
+            if stop > start:
+                yield track_id, Routed(self._t_ns[start:stop], self._polarity[start:stop])
+            start = stop
+
 
 NOTHING_ROUTED = RoutedEvents.of({})
 
