@@ -11,10 +11,12 @@ from hypothesis import strategies as st
 from test_detection import in_pieces
 
 from beacon_comm.core import motion
+from beacon_comm.core.blobs import Blob
 from beacon_comm.core.detection import Detector
 from beacon_comm.core.events import EventBatch
 from beacon_comm.core.following import FollowingRouter, _doubted
-from beacon_comm.core.hop_events import CODE_BITS, nothing_near
+from beacon_comm.core.hop_events import CODE_BITS, NOTHING_NEAR, NearEvents
+from beacon_comm.core.index_image import IndexImages
 from beacon_comm.core.motion_tracks import MotionTrack
 from beacon_comm.core.nearest import cells_along, events_in
 from beacon_comm.core.parameters import Parameters
@@ -82,19 +84,26 @@ def test_a_fast_blob_is_one_track_that_gets_its_events(path: Path, within_px: fl
 
 
 @pytest.mark.parametrize('path', [still(100.0, 90.0), bouncing(2000.0), circling(5000.0), bouncing(8000.0)])
-def test_what_is_listed_near_tracks_is_all_that_lies_there(path: Path) -> None:
+def test_what_is_listed_near_tracks_is_all_that_lies_there(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     detector = Detector(Parameters(bit_rates=(1000.0,), tracker='motion'), SIZE)
+    find, seen = detector._blobs.find, []
+
+    def note(images: IndexImages, t_hop_ns: int, near: NearEvents) -> list[Blob]:
+        seen.append(NearEvents(near.events.copy(), near.cells))
+        return find(images, t_hop_ns, near)
+
+    monkeypatch.setattr(detector._blobs, 'find', note)
     across, near = cells_along(SIZE[0]), 0
     for part in hops(merged(along(path, 0.0, 0.5), noise(*SIZE, 300_000, 0.5))):
         followed = bool(detector.tracks)
         for cut in (slice(0, 700), slice(700, 701), slice(701, len(part))):
             detector.route(part.slice(cut.start, cut.stop, part.t_end_ns))
         detector.hop(part.t_end_ns)
-        newest, grid = detector._images.newest, detector._images.grid
-        assert followed or not newest.near_cells.any()
-        near_code, near_offset_ns = newest.near
-        there = events_in(newest.near_cells, across, newest.code, grid.shift)
-        listed = events_in(newest.near_cells, across, near_code, grid.shift)
+        newest, near_events, grid = detector._images.newest, seen[-1], detector._images.grid
+        assert followed or not near_events.cells.any()
+        near_code, near_offset_ns = near_events.events
+        there = events_in(near_events.cells, across, newest.code, grid.shift)
+        listed = events_in(near_events.cells, across, near_code, grid.shift)
         assert np.array_equal(near_code[listed] >> CODE_BITS, newest.code[there] >> CODE_BITS)
         assert np.array_equal(near_offset_ns[listed], newest.offset_ns[there])
         near += len(there)
@@ -109,7 +118,7 @@ def test_blobs_that_are_observed_by_what_is_near_are_those_of_all_events(path: P
         detector, states = Detector(Parameters(bit_rates=(1000.0,), tracker='motion'), SIZE), []
         detect(detector, events, lambda t, changes, d=detector, s=states: s.append(repr([*d.tracks.values(), changes])))
         seen.append(states)
-        monkeypatch.setattr(FollowingRouter, '_near', lambda router: nothing_near())
+        monkeypatch.setattr(FollowingRouter, 'near', NOTHING_NEAR)
     assert seen[0] == seen[1] and len(seen[0]) > 45
 
 

@@ -39,7 +39,7 @@ from beacon_comm.core.components import (
     ComponentSet,
     paint,
 )  # fmt: skip
-from beacon_comm.core.hop_events import CODE_BITS, HopEvents, PixelGrid
+from beacon_comm.core.hop_events import CODE_BITS, NOTHING_NEAR, HopEvents, NearEvents, PixelGrid
 from beacon_comm.core.index_image import IndexImages, Window, hop_length_ns, pixel_counts, window_hops
 from beacon_comm.core.nearest import CELL_SHIFT, cells_along, cells_with_members, events_in, list_cells
 from beacon_comm.core.parameters import Parameters
@@ -114,8 +114,14 @@ class BlobFinder:
         self.owner = np.zeros(self._grid.numbers, np.int32)
         self.box = np.empty((0, 4))
 
-    def find(self, images: IndexImages, t_hop_ns: int) -> list[Blob]:
-        """Return the blobs at the hop that ends at ``t_hop_ns`` (ns)."""
+    def find(self, images: IndexImages, t_hop_ns: int, near: NearEvents = NOTHING_NEAR) -> list[Blob]:
+        """Return the blobs at the hop that ends at ``t_hop_ns`` (ns).
+
+        Args:
+            images: at that hop.
+            t_hop_ns: its end (ns).
+            near: what is known of its events near tracks.
+        """
         for components in self._sets:
             paint(components.run, self.owner, 0)
         self._sets, self.box = [], np.empty((0, 4))
@@ -126,7 +132,7 @@ class BlobFinder:
         if len(window) == 0:
             return []
         self.box = sums[:, LEFT : BOTTOM + 1].astype(np.float64)
-        return self._observe(window, sums, index, images.newest, t_hop_ns)
+        return self._observe(window, sums, index, images.newest, near, t_hop_ns)
 
     def _choose(self, windows: list[Window]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
         """Let the components that stand as blobs own their pixels; return of each its window, sums and index."""
@@ -145,18 +151,19 @@ class BlobFinder:
         sums: NDArray[np.int64],
         index: NDArray[np.float64],
         newest: HopEvents,
+        near: NearEvents,
         t_hop_ns: int,
     ) -> list[Blob]:
         """Observe the components that stand; see the module's head.
 
         Args:
             window, sums, index: of each, as in :class:`Blob` and :class:`ComponentSet`.
-            newest: the newest hop's events.
+            newest, near: the newest hop's events.
             t_hop_ns: its end (ns).
         """
         p = self._parameters
         seen = _observe(
-            window, sums, self._length, newest.code, newest.offset_ns, newest.near, newest.near_cells,
+            window, sums, self._length, newest.code, newest.offset_ns, near.events, near.cells,
             (self._grid.width, self._grid.height, self._grid.shift), p.routing_extent_factor, p.routing_margin_px, self._hop_ns,
             self.owner,
         )  # fmt: skip

@@ -183,7 +183,7 @@ class Detector:
         self._fill_buffers()
         self._images.push(self._router.close())
         self._exchange()
-        blobs = self._blobs.find(self._images, t_hop_ns)
+        blobs = self._blobs.find(self._images, t_hop_ns, self._router.near)
         changes = self._tracker.update(blobs, t_hop_ns)
         self._keep_buffers(blobs, changes, t_hop_ns)
         self._router.aim(tuple(self._tracker.tracks.values()), t_hop_ns)

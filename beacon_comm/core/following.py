@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 
 from beacon_comm.core import motion
 from beacon_comm.core.events import NS_PER_S, EventBatch
-from beacon_comm.core.hop_events import ROUTED, HopEvents
+from beacon_comm.core.hop_events import ROUTED, HopEvents, NearEvents
 from beacon_comm.core.motion import (
     AHEAD,
     DOUBTED_X,
@@ -167,8 +167,10 @@ class FollowingRouter(Router):
         self.settle()
         return super().close()
 
-    def _near(self) -> tuple[NDArray[np.uint32], NDArray[np.uint8]]:
-        return self._listed[:, : self._near_count[0]].copy(), self._near_cells
+    @property
+    def near(self) -> NearEvents:
+        """The events of the hop that lie near tracks; views that stay as they are until the next hop's are routed."""
+        return NearEvents(self._listed[:, : self._near_count[0]], self._near_cells)
 
     def settle(self) -> None:
         """Tell the tracks what the events since the last hop say about them."""
@@ -187,7 +189,7 @@ def _follow(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """List the events that are of a track, with their tracks; move the tracks on; return how many, and the cells' lists.
 
-    ``listed``, ``near_count``, ``near_cells``: for :class:`HopEvents`.
+    ``listed``, ``near_count``, ``near_cells``: for :class:`NearEvents`.
     """
     across, down = cells_along(width), cells_along(height)
     step_s = step_ns * 1e-9

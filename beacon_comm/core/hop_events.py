@@ -17,7 +17,8 @@ and polarity at most: one with more of both than that in a hop has the index of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -88,9 +89,6 @@ class HopEvents:
         planes: bits of their pixels' counts, ``(k,)`` uint64; see the module's head.
         t_start_ns: the hop's begin (ns, sensor clock).
         room: events that there is room for where ``code`` and ``offset_ns`` stand.
-        near: code and offset of some events, in order, among them all that lie in ``near_cells``, ``(2, k)`` uint32; codes
-            without flag.
-        near_cells: whether each cell of :mod:`beacon_comm.core.nearest` is one of these, ``(cells,)`` uint8; empty: none is.
     """
 
     code: NDArray[np.uint32]
@@ -100,34 +98,38 @@ class HopEvents:
     planes: NDArray[np.uint64]
     t_start_ns: int
     room: int
-    near: NDArray[np.uint32]
-    near_cells: NDArray[np.uint8]
 
     def __len__(self) -> int:
         return len(self.code)
 
     @property
     def size_bytes(self) -> int:
-        """What it takes without what is near; nothing without events."""
+        """What it takes; nothing without events."""
         counts = self.rows.nbytes + self.first.nbytes + self.planes.nbytes
         return counts + self.room * (self.code.itemsize + self.offset_ns.itemsize) if len(self) else 0
 
-    def alone(self) -> HopEvents:
-        """Return it without what is near: that is for the newest hop's blobs alone."""
-        near, near_cells = nothing_near()
-        return replace(self, near=near, near_cells=near_cells)
+
+class NearEvents(NamedTuple):
+    """Events of the newest hop that lie near tracks.
+
+    Attributes:
+        events: code, without flag, and offset of some events, in order, among them all that lie in ``cells``,
+            ``(2, k)`` uint32.
+        cells: whether each cell of :mod:`beacon_comm.core.nearest` is one of these, ``(cells,)`` uint8; empty: none is.
+    """
+
+    events: NDArray[np.uint32]
+    cells: NDArray[np.uint8]
 
 
-def nothing_near() -> tuple[NDArray[np.uint32], NDArray[np.uint8]]:
-    """Return no events, of no cells."""
-    return np.empty((2, 0), np.uint32), np.empty(0, np.uint8)
+NOTHING_NEAR = NearEvents(np.empty((2, 0), np.uint32), np.empty(0, np.uint8))
 
 
 def no_events() -> HopEvents:
     """Return a hop without events."""
     none = np.empty(0, np.uint32)
     counts = np.empty(0, np.int64), np.zeros(1, np.int64), np.empty(0, np.uint64)
-    return HopEvents(none, none, *counts, 0, 0, *nothing_near())
+    return HopEvents(none, none, *counts, 0, 0)
 
 
 def empty_planes(grid: PixelGrid, planes: int) -> NDArray[np.uint64]:

@@ -100,7 +100,6 @@ class IndexImages:
         self._none = no_events()
         self._ring: deque[HopEvents] = deque([self._none] * self.windows[-1].hops, maxlen=self.windows[-1].hops)
         self._ring_bytes = 0
-        self._newest = self._none
         self.overflow_events = 0
 
     def _empty_window(self, hops: int) -> Window:
@@ -116,7 +115,7 @@ class IndexImages:
     @property
     def newest(self) -> HopEvents:
         """The events of the newest hop."""
-        return self._newest
+        return self._ring[-1]
 
     def hop_events(self, window: Window) -> Sequence[HopEvents]:
         """Return the hops in ``window``, oldest first."""
@@ -127,8 +126,7 @@ class IndexImages:
         for window in self.windows:
             self._slide(window, self._ring[-window.hops], events)
         self._ring_bytes += events.size_bytes - self._ring[0].size_bytes
-        self._ring.append(events.alone())
-        self._newest = events
+        self._ring.append(events)
         if self._ring_bytes > self._max_bytes:
             self._drop_oldest()
 

@@ -23,7 +23,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from beacon_comm.core.events import EventBatch
-from beacon_comm.core.hop_events import CODE_BITS, ROUTED, HopCounts, HopEvents, PixelGrid, nothing_near
+from beacon_comm.core.hop_events import CODE_BITS, NOTHING_NEAR, ROUTED, HopCounts, HopEvents, NearEvents, PixelGrid
 from beacon_comm.core.index_image import hop_length_ns
 from beacon_comm.core.nearest import CELL_SHIFT, cell_lists, cells_along, cells_with_members
 from beacon_comm.core.parameters import Parameters
@@ -235,11 +235,12 @@ class Router:
             code, offset_ns, room = code.copy(), offset_ns.copy(), n
         else:
             self._code, self._offset_ns = np.empty_like(self._code), np.empty_like(self._offset_ns)
-        return HopEvents(code, offset_ns, *self._counts.take(), self._t_hop_ns, room, *self._near())
+        return HopEvents(code, offset_ns, *self._counts.take(), self._t_hop_ns, room)
 
-    def _near(self) -> tuple[NDArray[np.uint32], NDArray[np.uint8]]:
-        """Return the hop's events that lie near tracks, and where that is; see :class:`HopEvents`."""
-        return nothing_near()
+    @property
+    def near(self) -> NearEvents:
+        """The events of the hop that lie near tracks; views that stay as they are until the next hop's are routed."""
+        return NOTHING_NEAR
 
     def _make_room(self, n: int) -> None:
         room = math.ceil(_MORE_ROOM * (self._gathered + n))

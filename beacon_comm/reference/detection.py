@@ -20,6 +20,7 @@ from beacon_comm.core.detection import Detector
 from beacon_comm.core.errors import ParameterError
 from beacon_comm.core.event_buffer import EventBuffer
 from beacon_comm.core.events import EventBatch
+from beacon_comm.core.hop_events import NOTHING_NEAR, NearEvents
 from beacon_comm.core.index_image import hop_length_ns, window_hops
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.routing import Routed, RoutedEvents
@@ -50,6 +51,8 @@ def _joined(parts: Sequence[ReferenceEvents]) -> ReferenceEvents:
 
 class ReferenceRouter:
     """Every event to the nearest track whose circle holds it: one track after the other, all events at once."""
+
+    near = NOTHING_NEAR
 
     def __init__(self, parameters: Parameters, sensor_size: tuple[int, int]) -> None:
         self._parameters = parameters
@@ -201,8 +204,10 @@ class ReferenceBlobFinder(BlobFinder):
         self.owner: NDArray[np.int64] = np.zeros(sensor_size[::-1], np.int64)  # type: ignore[assignment]
         self._t_start_ns = 0
 
-    def find(self, images: ReferenceImages, t_hop_ns: int) -> list[Blob]:  # type: ignore[override]
-        """Return the blobs at the hop that ends at ``t_hop_ns`` (ns)."""
+    def find(  # type: ignore[override]
+        self, images: ReferenceImages, t_hop_ns: int, near: NearEvents = NOTHING_NEAR
+    ) -> list[Blob]:
+        """Return the blobs at the hop that ends at ``t_hop_ns`` (ns); all of its events are looked at, whatever is near."""
         self._t_start_ns = t_hop_ns - self._hop_ns
         p = self._parameters
         self.owner = np.zeros_like(self.owner)
