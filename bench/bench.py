@@ -32,6 +32,7 @@ from streams import DENSE, Stream, make_stream, messages, real_words  # noqa: E4
 from beacon_comm.compiling.warm_up import warm_up  # noqa: E402
 from beacon_comm.core.detection import Detector  # noqa: E402
 from beacon_comm.core.parameters import Parameters  # noqa: E402
+from beacon_comm.recordings.folder import recordings_folder
 from beacon_comm.reference.detection import ReferenceDetector  # noqa: E402
 from beacon_comm.reference.evt3 import ReferenceEvt3Decoder  # noqa: E402
 from beacon_comm.wire.cdr import build_event_packet, parse_event_packet  # noqa: E402
@@ -358,8 +359,7 @@ SECTIONS: dict[str, Callable[[Path], MetricTable]] = {
 def main() -> None:
     """Run the sections asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    usual = os.environ.get('BEACON_COMM_DATA', PROJECT.parent / 'shared' / 'data')
-    parser.add_argument('--folder', type=Path, default=usual, help='folder of the recordings')
+    parser.add_argument('--folder', type=Path, default=recordings_folder(), help='folder of the recordings')
     parser.add_argument('--only', nargs='+', choices=SECTIONS, default=list(SECTIONS), help='sections to run')
     parser.add_argument('--json', type=Path, default=PROJECT / 'bench.json', help='where the metrics go')
     parser.add_argument('--figure', type=Path, help='where the plot of the scaling goes')

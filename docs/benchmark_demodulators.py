@@ -17,7 +17,6 @@ multiplication and addition an event.  Figures are medians over the repeats, tim
 from __future__ import annotations
 
 import argparse
-import os
 import platform
 import time
 from collections.abc import Iterable, Iterator
@@ -32,9 +31,9 @@ from beacon_comm.core.demodulator import Demodulator, make_demodulator
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.evaluation.receivers import declared_receivers
+from beacon_comm.recordings.folder import recordings_folder
 from beacon_comm.recordings.mat import read_mat
 
-PROJECT = Path(__file__).resolve().parents[1]
 RECORDINGS = {'504hz_30m.mat': 504.0, '3125hz_30m.mat': 3125.0}
 SEVERAL_BPS = (100.0, 504.0, 1000.0, 3125.0, 10_000.0)
 PACKETS_NS = {'1 ms': 1_000_000, '10 ms': 10_000_000, '100 ms': 100_000_000, 'whole': None}
@@ -188,8 +187,7 @@ def print_recording(name: str, events: Events, bit_rate_bps: float, repeats: int
 def main() -> None:
     """Print everything."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    usual = os.environ.get('BEACON_COMM_DATA', PROJECT.parent / 'shared' / 'data')
-    parser.add_argument('--folder', type=Path, default=usual, help='folder of the recordings')
+    parser.add_argument('--folder', type=Path, default=recordings_folder(), help='folder of the recordings')
     parser.add_argument('--repeats', type=int, default=5)
     arguments = parser.parse_args()
     print('# Cost of demodulation, one core\n')

@@ -17,7 +17,6 @@ sensor's defaults.
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,6 +32,7 @@ from beacon_comm.core.parameters import Parameters
 from beacon_comm.evaluation import held
 from beacon_comm.evaluation.scoring import score, wilson_interval
 from beacon_comm.evaluation.truth import SONNET18, load_truth
+from beacon_comm.recordings.folder import recordings_folder
 from beacon_comm.recordings.mat import read_mat
 from beacon_comm.simulation.description import SceneDescription, read_description
 from beacon_comm.simulation.paths import Still
@@ -90,15 +90,10 @@ class Signal:
         )
 
 
-def data_folder() -> Path:
-    """Return the folder of the real recordings."""
-    return Path(os.environ.get('BEACON_COMM_DATA', PROJECT.parent / 'shared' / 'data'))
-
-
 def real_signal(name: str) -> Signal:
     """Return a recording from the begin of its last sending on, the line shifted to where the fit has it."""
     recorded = RECORDINGS[name]
-    t_ns, polarity = read_mat(data_folder() / f'{name}.mat')
+    t_ns, polarity = read_mat(recordings_folder() / f'{name}.mat')
     start_ns = round(recorded.start_s * NS_PER_S + recorded.shift_us * 1e3)
     bits = FRAME.encode_bits(SONNET18[: recorded.characters])
     changes_ns, levels = transitions(bits, recorded.bit_rate_bps, start_ns)

@@ -15,7 +15,6 @@ candidate slots.  Seed, family and number determine a scene; those with a confir
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -31,6 +30,7 @@ from beacon_comm.core.character import Status
 from beacon_comm.core.detection import Detector
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.receiver import Receiver
+from beacon_comm.recordings.folder import recordings_folder
 from beacon_comm.recordings.sources import Background
 from beacon_comm.simulation.description import make_description
 from beacon_comm.simulation.scene import simulate
@@ -38,7 +38,6 @@ from beacon_comm.simulation.scene import simulate
 Random = np.random.Generator
 Content = dict[str, Any]
 
-PROJECT = Path(__file__).resolve().parents[1]
 WIDTH, HEIGHT = 320, 240
 SENSOR = {'width': WIDTH, 'height': HEIGHT, 'psf_px': 0.9}  # a sharp lens: fewer pixels to simulate
 BAG_SENSOR = {**SENSOR, 'width': 640, 'height': 480}
@@ -162,11 +161,6 @@ class Count:
         return Count(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))
 
 
-def data_folder() -> Path:
-    """Return the folder of the real recordings."""
-    return Path(os.environ.get('BEACON_COMM_DATA', PROJECT.parent / 'shared' / 'data'))
-
-
 def families(folder: Path) -> dict[str, Callable[[Random], Content]]:
     """Return the families of scenes by name; those with the real bag only if it is there."""
     found = {**FAMILIES, CONTROL: control}
@@ -247,7 +241,7 @@ def main() -> None:
     parser.add_argument('--processes', type=int, default=1)
     parser.add_argument('--output', type=Path, help='write the page to this file')
     options = parser.parse_args()
-    folder = data_folder()
+    folder = recordings_folder()
     names = list(families(folder))
     if len(names) < len(FAMILIES) + 1:
         print(f'no recordings at {folder}: no recorded room; set BEACON_COMM_DATA', file=sys.stderr)

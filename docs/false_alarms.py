@@ -14,7 +14,6 @@ The seed, the family and the number of a candidate determine it: the ones that w
 from __future__ import annotations
 
 import argparse
-import os
 import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -37,13 +36,13 @@ from beacon_comm.evaluation.receivers import declared_receivers
 from beacon_comm.evaluation.scoring import wilson_interval
 from beacon_comm.evaluation.truth import SONNET18
 from beacon_comm.recordings.bags import open_recording
+from beacon_comm.recordings.folder import recordings_folder
 from beacon_comm.simulation.led import OUTDOOR_30_M, Burst, LedModel, noise, simulate_levels, simulate_text, square_wave
 from beacon_comm.wire.stream import EventStream
 
 Events = tuple[NDArray[np.int64], NDArray[np.int8]]
 Random = np.random.Generator
 
-PROJECT = Path(__file__).resolve().parents[1]
 T0_NS = 2**40
 FRAME_BITS = CharacterFrame().length
 RATES_BPS = Parameters().bit_rates
@@ -262,11 +261,6 @@ def beacon(random: Random) -> Events:
 
 
 # Patches of the real bags
-
-
-def data_folder() -> Path:
-    """Return the folder of the real recordings."""
-    return Path(os.environ.get('BEACON_COMM_DATA', PROJECT.parent / 'shared' / 'data'))
 
 
 @lru_cache(maxsize=len(BAGS))
@@ -531,9 +525,9 @@ def main() -> None:
     parser.add_argument('--output', type=Path, help='write the page to this file')
     arguments = parser.parse_args()
     count = arguments.count or (FULL_COUNT if arguments.full else DEFAULT_COUNT)
-    folder = data_folder() if (data_folder() / BAGS[0]).is_dir() else None
+    folder = recordings_folder() if (recordings_folder() / BAGS[0]).is_dir() else None
     if folder is None:
-        print(f'no recordings at {data_folder()}: no patches of bags; set BEACON_COMM_DATA', file=sys.stderr)
+        print(f'no recordings at {recordings_folder()}: no patches of bags; set BEACON_COMM_DATA', file=sys.stderr)
     declared = declared_receivers()
     receivers = {name: declared[name] for name in chosen(declared, arguments.receivers)}
     names = [*chosen(families(folder), arguments.families), CONTROL]

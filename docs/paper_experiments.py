@@ -18,7 +18,6 @@ count; where no start is found in what was decoded, message accuracy is 0 and bi
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -44,6 +43,7 @@ from beacon_comm.evaluation.scoring import Transmission, not_found, score, score
 from beacon_comm.evaluation.stress_report import markdown_table
 from beacon_comm.evaluation.truth import SONNET18
 from beacon_comm.evaluation.views import Stretch, Trace, trace_filter
+from beacon_comm.recordings.folder import recordings_folder
 from beacon_comm.recordings.mat import read_mat
 from beacon_comm.simulation.description import make_description
 from beacon_comm.simulation.scene import simulate
@@ -561,8 +561,7 @@ def events_table(points: Sequence[Point], room: str) -> str:
 def main() -> None:
     """Run everything; print the page or write it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    usual = os.environ.get('BEACON_COMM_DATA', PROJECT.parent / 'shared' / 'data')
-    parser.add_argument('--folder', type=Path, default=usual, help='folder of the recordings')
+    parser.add_argument('--folder', type=Path, default=recordings_folder(), help='folder of the recordings')
     parser.add_argument('--full', action='store_true', help='every distance and bit rate, for the page')
     parser.add_argument('--write', action='store_true', help='write the page and its figures')
     parser.add_argument('--output', type=Path, default=PAGE, help='where to (default: docs/paper_experiments.md)')

@@ -23,7 +23,6 @@ exactly it is known when it came.
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -41,9 +40,9 @@ from beacon_comm.core.parameters import Parameters
 from beacon_comm.evaluation.held import Signal
 from beacon_comm.evaluation.scoring import Transmission, score, score_at
 from beacon_comm.evaluation.truth import SONNET18
+from beacon_comm.recordings.folder import recordings_folder
 from beacon_comm.recordings.mat import read_mat
 
-PROJECT = Path(__file__).resolve().parents[1]
 RECORDINGS = {'504hz_30m.mat': 504.0, '3125hz_30m.mat': 3125.0}
 BOTH_BPS = tuple(RECORDINGS.values())
 BATCH_NS = 10_000_000
@@ -144,14 +143,9 @@ def receivers(nominal_bps: float) -> dict[str, Parameters]:
     }
 
 
-def data_folder() -> Path:
-    """Return the folder of the real recordings."""
-    return Path(os.environ.get('BEACON_COMM_DATA', PROJECT.parent / 'shared' / 'data'))
-
-
 def recorded(name: str, nominal_bps: float) -> Recording:
     """Return a recording; what was sent when is told by the paper's receiver, from the beginning on."""
-    t_ns, polarity = read_mat(data_folder() / name)
+    t_ns, polarity = read_mat(recordings_folder() / name)
     parameters = Parameters(receiver='threshold', bit_rates=(nominal_bps,))
     given, _ = decode(t_ns, polarity, parameters, lambda _: BATCH_NS)
     span_ns = int(t_ns[0]), int(t_ns[-1])

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -47,6 +46,7 @@ from beacon_comm.evaluation.reliability import (
 )
 from beacon_comm.evaluation.scoring import score, wilson_interval
 from beacon_comm.evaluation.truth import SONNET18
+from beacon_comm.recordings.folder import recordings_folder
 from beacon_comm.recordings.mat import read_mat
 from beacon_comm.simulation import stress
 from beacon_comm.simulation.led import simulate_text
@@ -86,15 +86,10 @@ class Waveform:
     sendings: tuple[Due, ...]
 
 
-def data_folder() -> Path:
-    """Return the folder of the real recordings."""
-    return Path(os.environ.get('BEACON_COMM_DATA', PROJECT.parent / 'shared' / 'data'))
-
-
 @lru_cache(maxsize=len(RECORDED))
 def recorded(name: str) -> Waveform:
     """Return a real recording; what was sent when is found in what the paper's receiver reads of it, unstressed."""
-    t_ns, polarity = read_mat(data_folder() / name)
+    t_ns, polarity = read_mat(recordings_folder() / name)
     bit_rate_bps = RECORDED[name]
     characters = receive((t_ns, polarity), Parameters(receiver='threshold', bit_rates=(bit_rate_bps,)))
     sendings = []
@@ -510,9 +505,9 @@ def main() -> None:
     seeds = arguments.seeds or (FULL_SEEDS if arguments.full else QUICK_SEEDS)
     if seeds < 2:
         parser.error('--seeds: 2 at least')
-    sources = [*(name for name in RECORDED if (data_folder() / name).is_file()), *SIMULATED]
+    sources = [*(name for name in RECORDED if (recordings_folder() / name).is_file()), *SIMULATED]
     if len(sources) == len(SIMULATED):
-        print(f'no recordings at {data_folder()}: simulated waveforms only; set BEACON_COMM_DATA', file=sys.stderr)
+        print(f'no recordings at {recordings_folder()}: simulated waveforms only; set BEACON_COMM_DATA', file=sys.stderr)
     wanted = (arguments.receivers or '').split(',')
     declared = declared_receivers(bit_rates=LISTED_BPS)
     receivers = {name: parameters for name, parameters in declared.items() if any(word in name for word in wanted)}

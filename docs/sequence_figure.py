@@ -10,7 +10,6 @@ a lone 0 between two 1s, the hardest of all bits.  Both receivers read the recor
 from __future__ import annotations
 
 import argparse
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,7 @@ from beacon_comm.core.parameters import Parameters
 from beacon_comm.evaluation.held import Signal
 from beacon_comm.evaluation.scoring import score
 from beacon_comm.evaluation.truth import SONNET18
+from beacon_comm.recordings.folder import recordings_folder
 from beacon_comm.recordings.mat import read_mat
 
 PROJECT = Path(__file__).resolve().parents[1]
@@ -261,8 +261,7 @@ def draw(found: Stretch, path: Path) -> None:
 def main() -> None:
     """Draw the figure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    usual = os.environ.get('BEACON_COMM_DATA', PROJECT.parent / 'shared' / 'data')
-    parser.add_argument('--folder', type=Path, default=usual, help='folder of the recordings')
+    parser.add_argument('--folder', type=Path, default=recordings_folder(), help='folder of the recordings')
     parser.add_argument('--output', type=Path, default=FIGURE)
     arguments = parser.parse_args()
     draw(stretch(Path(arguments.folder) / RECORDING), arguments.output)

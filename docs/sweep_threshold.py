@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,11 +23,11 @@ from beacon_comm.evaluation.held import Signal
 from beacon_comm.evaluation.scoring import Transmission, score
 from beacon_comm.evaluation.truth import SONNET18
 from beacon_comm.recordings.disc import Disc
+from beacon_comm.recordings.folder import recordings_folder
 from beacon_comm.recordings.mat import read_mat
 from beacon_comm.recordings.scene import Scene
 from beacon_comm.recordings.sources import Background, Clip, mat_beacon
 
-PROJECT = Path(__file__).resolve().parents[1]
 NAMES = ('504hz_30m.mat', '3125hz_30m.mat')
 CUTOFFS = {'1/3': 1 / 3, '1': 1.0, '1.5': 1.5, '2π/3': 2 * math.pi / 3, '2.5': 2.5, '3': 3.0, '4': 4.0}
 LOW_SHARES = (0.01, 0.02, 0.035, 0.05, 0.07, 0.09, 0.1, 0.15, 0.2, 0.3)
@@ -116,8 +115,7 @@ def nanoseconds_an_event(t_ns: NDArray[np.int64], polarity: NDArray[np.int8], bi
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    usual = os.environ.get('BEACON_COMM_DATA', PROJECT.parent / 'shared' / 'data')
-    parser.add_argument('--folder', type=Path, default=usual, help='folder of the recordings')
+    parser.add_argument('--folder', type=Path, default=recordings_folder(), help='folder of the recordings')
     folder = Path(parser.parse_args().folder)
     events = {name: read_mat(folder / name) for name in NAMES}
     slow, fast = (events[name] for name in NAMES)

@@ -6,17 +6,17 @@ from pathlib import Path
 import pytest
 
 from beacon_comm.compiling.cache import ensure_compiler_cache, save_one_at_a_time
+from beacon_comm.recordings.folder import recordings_folder
 
 ensure_compiler_cache()  # before anything imports numba
 save_one_at_a_time()
 
-PROJECT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope='session')
 def data_folder() -> Path:
     """Return the folder of real recordings; skip without it, fail without it on CI."""
-    folder = Path(os.environ.get('BEACON_COMM_DATA', PROJECT.parent / 'shared' / 'data'))
+    folder = recordings_folder()
     if folder.is_dir():
         return folder
     if os.environ.get('CI', '').lower() == 'true':

@@ -25,6 +25,7 @@ from beacon_comm.cli.demo_scene import REAL_FILES, real_scene, simulated_scene
 from beacon_comm.cli.demo_verdict import judge
 from beacon_comm.core.errors import BeaconCommError
 from beacon_comm.recordings.bag_writer import BagWriter
+from beacon_comm.recordings.folder import recordings_folder
 from beacon_comm.recordings.interfaces import PACKET_TYPE
 from beacon_comm.recordings.scene import Scene
 
@@ -109,7 +110,7 @@ def _config(name: str) -> Path:
 
 
 def _scene(simulate: bool) -> Scene:
-    folder = Path(os.environ.get('BEACON_COMM_DATA', PROJECT.parent / 'shared' / 'data'))
+    folder = recordings_folder()
     missing = [name for name in REAL_FILES if not (folder / name).exists()]
     if simulate or missing:
         say(f'recording: simulated ({"as asked" if simulate else f"no {missing[0]} in {folder}"})')

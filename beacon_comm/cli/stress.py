@@ -11,11 +11,10 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path, PurePath
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -32,6 +31,7 @@ from beacon_comm.evaluation.held import Signal
 from beacon_comm.evaluation.receivers import declared_receivers
 from beacon_comm.evaluation.scoring import Transmission, not_found, score, score_at
 from beacon_comm.evaluation.stress_report import Stress, StressCount, StressedWaveform, StressResults
+from beacon_comm.recordings.folder import recordings_folder
 from beacon_comm.recordings.mat import read_mat
 from beacon_comm.simulation.led import OUTDOOR_30_M, simulate_text
 from beacon_comm.simulation.stress import (
@@ -49,7 +49,6 @@ from beacon_comm.simulation.stress import (
     with_leak,
 )
 
-PROJECT = Path(__file__).resolve().parents[2]
 RECORDINGS = ('504hz_30m.mat', '3125hz_30m.mat')
 SIMULATED_BPS = (504.0, 1000.0, 3125.0)
 REFERENCE = 'threshold'
@@ -287,7 +286,7 @@ def chosen_stresses(only: Sequence[str] | None) -> tuple[Stress, ...]:
 
 def default_recordings() -> list[str]:
     """Return the paper's recordings at 30 m that are in ``BEACON_COMM_DATA``, by default ``../shared/data``."""
-    folder = Path(os.environ.get('BEACON_COMM_DATA', PROJECT.parent / 'shared' / 'data'))
+    folder = recordings_folder()
     return [str(folder / name) for name in RECORDINGS if (folder / name).is_file()]
 
 
