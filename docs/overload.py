@@ -219,16 +219,20 @@ class Driver:
 
 def capacity(driver: Driver, stream: Stream) -> float:
     """Return how many events a second (1/s) the node reads all of."""
-    step, rising = 0, True
-    while True:
+
+    def offer(step: int) -> Phase:
         phase = Phase('step')
         driver.run(phase, stream.packets(STEP_S, FIRST_EV_PER_S * MORE**step))
         print(f'{phase.offered_ev_per_s / 1e6:.1f} Mev/s: {phase.unread:.0%} unread', file=sys.stderr)
-        enough = phase.unread > TOO_MUCH or step == STEPS
-        if step < -STEPS or not (rising or enough):
-            return phase.offered_ev_per_s
-        rising = rising and not enough
-        step += 1 if rising else -1
+        return phase
+
+    step = 0
+    while (phase := offer(step)).unread <= TOO_MUCH and step < STEPS:
+        step += 1
+    while phase.unread > TOO_MUCH and step > -STEPS:
+        step -= 1
+        phase = offer(step)
+    return phase.offered_ev_per_s
 
 
 def main() -> int:
