@@ -6,13 +6,16 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
-from live_session import BIT_RATE, MS, PACKET_NS, STAMP_NS, START_NS, TEXT, TYPE, Session, beacon_events, packets
+from live_session import BIT_RATE, MS, PACKET_NS, STAMP_NS, START_NS, TEXT, TYPE, Heard, Session, beacon_events, packets
 
 from beacon_comm.compiling.warm_up import warm_up
 from beacon_comm.core.bearing import CameraModel
+from beacon_comm.core.character import Status
 from beacon_comm.core.detection import Detector
 from beacon_comm.core.events import NS_PER_S
+from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.ros.live import Step
 from beacon_comm.ros.report import Report
@@ -118,6 +121,38 @@ def test_a_stalled_publisher_costs_some_characters_and_no_more() -> None:
             # True sensor time all through: the n-th bit of the text is where it was sent.
             position = (stamped.at.sensor_ns - START_NS) * BIT_RATE / NS_PER_S / 11
             assert position % 1.0 < 0.1 or position % 1.0 > 0.9 or 115 < position < 200
+
+
+@pytest.mark.parametrize('receiver', ['sequence', 'threshold'])
+def test_half_a_character_before_a_silence_is_not_ok(receiver: str) -> None:
+    """The rest of it would be taken for a line that is held high, and half of these have the right parity."""
+    events = beacon_events()
+    length_ns = CharacterFrame().duration_ns(BIT_RATE)
+    halves = 0
+    for eighth in range(1, 9):
+        stop = int(np.searchsorted(events.t_ns, START_NS + (60 + eighth / 8.5) * length_ns))
+        session = Session(receiver=receiver)
+        session.push(packets(events.slice(0, stop, int(events.t_ns[stop - 1]))))
+        session.wait(0.5)
+        last = session.characters()[-1].character
+        halves += last.status is Status.REPAIRED and last.confidence <= 0.5
+        assert not Heard(session.characters(), TEXT).wrong_ok
+    assert halves > 1
+
+
+@pytest.mark.parametrize('lost', [0, 7])
+@pytest.mark.parametrize('receiver', ['sequence', 'threshold'])
+def test_a_silence_in_which_packets_were_lost_or_late_tears_the_stream(receiver: str, lost: int) -> None:
+    every = packets(beacon_events())
+    for cut in range(25, 37):
+        session = Session(receiver=receiver)
+        session.push(every[:cut])
+        session.wait(0.5)
+        session.push(every[cut + lost :])
+        session.wait(0.5)
+        heard = Heard(session.characters(), TEXT)
+        assert not heard.wrong_ok
+        assert len(heard.right) > len(TEXT) - 8 - 2 * lost
 
 
 def test_another_publisher_begins_a_new_stream_and_labels_go_on() -> None:

@@ -16,21 +16,22 @@ Slots change hands only in :meth:`CandidateSlots.assign`, on the hop grid of eve
 about it is a function of the events before that hop: however the stream is cut into batches, the result is the same.
 
 Where events are missing, characters are *erased*: those that overlap the gap or begin within ``UNSETTLED_BITS`` behind it
-are neither given out nor counted, whatever a demodulator made of the hole.
+are neither given out nor counted, whatever a demodulator made of the hole.  Where the stream's time was carried on by a clock,
+nobody has vouched for the silence: a character with data or parity in it may be half a one, and is *repaired* at best.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from beacon_comm.core.character import Character
+from beacon_comm.core.character import Character, Status
 from beacon_comm.core.confirmation import ParityRecord
 from beacon_comm.core.demodulator import Demodulator, GapAware, Recognising, Searching
 from beacon_comm.core.event_buffer import buffer_length_ns
@@ -43,6 +44,9 @@ from beacon_comm.core.tracks import Track
 
 UNSETTLED_BITS = 1.0
 """An edge so close behind a gap (bit) may be the gap's end, and not the line's."""
+
+UNHEARD_CONFIDENCE = 0.5
+"""No character is surer that has data or parity where time was carried on."""
 
 _GAPS_KEPT_NS = 60 * NS_PER_S
 """Gaps are remembered for so long, or for ten buffers: a beacon that is found late is read from far back on."""
@@ -75,10 +79,10 @@ class ReceivedCharacter(NamedTuple):
 
 
 class Gaps:
-    """Stretches of the stream whose events are missing.
+    """Stretches of the stream whose events are missing, or not vouched for.
 
     Args:
-        kept_ns: gaps that ended longer ago than this (ns) are forgotten.
+        kept_ns: those that ended longer ago than this (ns) are forgotten.
     """
 
     def __init__(self, kept_ns: int) -> None:
@@ -90,6 +94,9 @@ class Gaps:
         """Take a gap (ns) behind those before."""
         old = bisect_right(self._stops, start_ns - self._kept_ns)
         del self._starts[:old], self._stops[:old]
+        if self._stops and self._stops[-1] == start_ns:
+            self._stops[-1] = stop_ns
+            return
         self._starts.append(start_ns)
         self._stops.append(stop_ns)
 
@@ -103,18 +110,19 @@ class Gaps:
         first = bisect_right(self._stops, t_ns)
         return list(zip(self._starts[first:], self._stops[first:], strict=True))
 
-    def erase(self, character: Character, end_ns: int) -> bool:
-        """Tell whether a character that ends at ``end_ns`` overlaps a gap, or begins too close behind one."""
-        unsettled_ns = round(UNSETTLED_BITS * NS_PER_S / character.bit_rate_bps)
-        first = bisect_right(self._stops, character.t_ns - unsettled_ns)
-        return first < len(self._starts) and self._starts[first] < end_ns
+    def overlap(self, start_ns: int, stop_ns: int) -> bool:
+        """Tell whether one of them has a part of the time from ``start_ns`` to ``stop_ns`` (ns)."""
+        first = bisect_right(self._stops, start_ns)
+        return first < len(self._starts) and self._starts[first] < stop_ns
 
 
 @dataclass(slots=True)
 class _Slot:
     demodulator: Demodulator
     record: ParityRecord
+    stop_bits: int
     gaps: Gaps
+    carried_on: Gaps
     read_to_ns: int | None
     """End of the last character that was given out or erased, in this turn or the ones before it."""
 
@@ -123,8 +131,12 @@ class _Slot:
         for character in characters:
             end_ns = self.record.end_of(character)
             self.read_to_ns = end_ns if self.read_to_ns is None else max(self.read_to_ns, end_ns)
-            if self.gaps.erase(character, end_ns):
+            bit_ns = NS_PER_S / character.bit_rate_bps
+            if self.gaps.overlap(character.t_ns - round(UNSETTLED_BITS * bit_ns), end_ns):
                 continue
+            if self.carried_on.overlap(character.t_ns, end_ns - round(self.stop_bits * bit_ns)):
+                status = Status.REPAIRED if character.status is Status.OK else character.status
+                character = replace(character, status=status, confidence=min(character.confidence, UNHEARD_CONFIDENCE))
             self.record.push(character)
             received.append(ReceivedCharacter(track_id, character))
         return received
@@ -168,7 +180,8 @@ class CandidateSlots:
         self._slots: dict[int, _Slot] = {}
         self._tried: dict[int, _Tried] = {}
         self._slots_full = False
-        self._gaps = Gaps(max(_GAPS_KEPT_NS, 10 * buffer_length_ns(parameters)) + round(parameters.lost_after_s * NS_PER_S))
+        kept_ns = max(_GAPS_KEPT_NS, 10 * buffer_length_ns(parameters)) + round(parameters.lost_after_s * NS_PER_S)
+        self._gaps, self._carried_on = Gaps(kept_ns), Gaps(kept_ns)
         self._last_looks = LastLooks[ReceivedCharacter](parameters.hop_s)
         self.search_share = 1.0
 
@@ -180,9 +193,14 @@ class CandidateSlots:
         for slot in self._slots.values():
             slot.miss(start_ns, stop_ns)
 
+    def carry_on(self, start_ns: int, stop_ns: int) -> None:
+        """Hear that nobody vouches for the stream's silence from ``start_ns`` to ``stop_ns`` (ns)."""
+        self._carried_on.add(start_ns, stop_ns)
+
     def forget_gaps(self) -> None:
         """Begin a new time."""
         self._gaps.clear()
+        self._carried_on.clear()
 
     def assign(self, tracks: Mapping[int, Track], t_ns: int, backlog: Backlog) -> list[ReceivedCharacter]:
         """Free the slots of demoted tracks and give free ones to the queue.
@@ -371,7 +389,8 @@ class CandidateSlots:
         tried = self._tried.pop(track_id, None)
         read_to_ns = None if tried is None else tried.read_to_ns
         first = 0 if read_to_ns is None else int(np.searchsorted(times, read_to_ns, 'left'))
-        slot = _Slot(self._make_demodulator(self._p), ParityRecord(self._p), self._gaps, read_to_ns)
+        demodulator, record = self._make_demodulator(self._p), ParityRecord(self._p)
+        slot = _Slot(demodulator, record, self._p.stop_bits, self._gaps, self._carried_on, read_to_ns)
         self._slots[track_id] = slot
         slot.record.advance(t_ns, quiet=False)
         if isinstance(slot.demodulator, Searching):

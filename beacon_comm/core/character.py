@@ -12,7 +12,8 @@ class Status(IntEnum):
     OK = 0
     """Start, parity and stop bits were right by evidence that could have failed."""
     REPAIRED = 1
-    """Only the frame structure rescued it, or other codes are too near; never given by the threshold receiver."""
+    """Only the frame structure rescued it, other codes are too near, or bits of it lie in a silence of the topic that nobody
+    vouches for; the threshold receiver gives the last alone."""
     PARITY_ERROR = 2
     """The parity bit contradicts the data bits."""
     FRAMING_ERROR = 3

@@ -10,6 +10,8 @@ A batch without events still moves the stream's time on, so that a silence ends 
 
 Where messages were lost, time is no silence but *missing*: nobody knows what was in it.  The batch after it says so:
 the stream between the batches before and ``missing_until_ns`` is missing.
+
+A batch that is *carried on* has no events and moves time by a clock alone: nobody said that nothing happened.
 """
 
 from __future__ import annotations
@@ -32,6 +34,7 @@ class EventBatch:
         t_ns: sensor time (ns), non-decreasing, ``(n,)`` int64.
         t_end_ns: the stream's time (ns) after this batch; see the module's head.
         missing_until_ns: end of the missing stretch before this batch (ns), at most ``t_end_ns``; None without one.
+        carried_on: see the module's head.
     """
 
     x: NDArray[np.uint16]
@@ -40,6 +43,7 @@ class EventBatch:
     t_ns: NDArray[np.int64]
     t_end_ns: int
     missing_until_ns: int | None = None
+    carried_on: bool = False
 
     def __len__(self) -> int:
         return len(self.t_ns)

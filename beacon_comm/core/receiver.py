@@ -136,6 +136,7 @@ class Receiver:
         self._camera = camera
         self._hop_ns = hop_length_ns(parameters)
         self._t_ns: int | None = None
+        self._heard_ns: int | None = None  # up to when the stream was heard, where it was carried on since
         self._confirmed: tuple[int, ...] = ()
         self._settled_ns: dict[int, int] = {}
         self._meetings = Meetings(parameters.hop_s) if parameters.tracker == 'motion' else None
@@ -160,8 +161,7 @@ class Receiver:
         """
         characters: list[ReceivedCharacter] = []
         lost: list[BeaconSnapshot] = []
-        if batch.missing_until_ns is not None and self._t_ns is not None:
-            self._slots.miss(self._t_ns, batch.missing_until_ns)
+        self._tell_what_is_unknown(batch)
         for segment, at_hop in self._segments(batch):
             routed = self._detection.route(segment)
             characters += self._slots.demodulate(routed, segment.t_end_ns)
@@ -188,7 +188,7 @@ class Receiver:
         """Go on after the sensor's clock was restarted: all tracks are lost, labels go on, time starts anew."""
         output = self._restart(self._detection.reset())
         self._slots.forget_gaps()
-        self._t_ns = None
+        self._t_ns = self._heard_ns = None
         return output
 
     def search_less(self, share: float) -> None:
@@ -234,6 +234,18 @@ class Receiver:
         if t_ns is None:
             return ()
         return tuple(self._snapshot(track, t_ns) for track in self._detection.tracks.values())
+
+    def _tell_what_is_unknown(self, batch: EventBatch) -> None:
+        """Tell the slots what is missing before a batch, or that nobody vouches for it."""
+        if self._t_ns is None:
+            return
+        if batch.carried_on:
+            self._slots.carry_on(self._t_ns, batch.t_end_ns)
+            self._heard_ns = self._t_ns if self._heard_ns is None else self._heard_ns
+            return
+        if batch.missing_until_ns is not None:
+            self._slots.miss(self._t_ns if self._heard_ns is None else self._heard_ns, batch.missing_until_ns)
+        self._heard_ns = None
 
     def _segments(self, batch: EventBatch) -> Iterator[tuple[EventBatch, bool]]:
         """Cut a batch at the points of the hop grid; yield each piece and whether it ends at one."""

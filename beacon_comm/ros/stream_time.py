@@ -11,8 +11,9 @@ nothing can be late any more, and it is ``silent_after``.
 
 A packet may be later than that (a paused bag) and hold events older than the time that was
 announced.  They are not squeezed into one instant, nor dropped: the sensor's clock is taken to have stood still for
-the difference, and everything from there on is *shifted* by it.  :meth:`StreamTime.sensor_ns` takes the shift out
-again, so outputs carry true sensor time.  After a late packet the lag is lengthened, so that a topic whose packets come
+the difference, and everything from there on is *shifted* by it.  What was announced in between was no silence: the stream
+is torn there, and said to be missing.  :meth:`StreamTime.sensor_ns` takes the shift out again, so outputs carry true sensor
+time.  After a late packet the lag is lengthened, so that a topic whose packets come
 at 0.6 s is late once, not always.
 """
 
@@ -53,7 +54,9 @@ class StreamTime:
     def admit(self, batch: EventBatch, now_ns: int) -> EventBatch:
         """Return a packet's batch in stream time; ``now_ns`` is the node's clock at its arrival (ns)."""
         shift_ns = self._shifts[-1][1]
+        missing_ns = batch.missing_until_ns
         if len(batch) and int(batch.t_ns[0]) + shift_ns < self._end_ns:
+            missing_ns = int(batch.t_ns[0])
             shift_ns = self._end_ns - int(batch.t_ns[0])
             self._shifts = [*self._shifts[-KEPT_SHIFTS:], (self._end_ns, shift_ns)]
             learnt_ns = min(2 * (now_ns - self._arrival_ns), LONGEST_LEARNT_LAG_NS)
@@ -64,7 +67,6 @@ class StreamTime:
         self._idle_ns = 0
         self._publisher_gone = False
         if shift_ns or batch.t_end_ns != self._end_ns:
-            missing_ns = batch.missing_until_ns
             batch = replace(
                 batch,
                 t_ns=batch.t_ns + shift_ns,
@@ -107,7 +109,7 @@ class StreamTime:
         if end_ns <= self._end_ns:
             return None
         self._end_ns = end_ns
-        return EventBatch.empty(end_ns)
+        return replace(EventBatch.empty(end_ns), carried_on=True)
 
     def sensor_ns(self, stream_ns: int) -> int:
         """Return the sensor time (ns) of a time of the stream (ns)."""
