@@ -219,7 +219,7 @@ class Parameters(Declared):
     association_gate_px: float = parameter(12.0, 'largest distance of a blob from the predicted centre', 'px', 0.1)
     gate_growth_px_per_s: float = parameter(40.0, 'growth of the gate while a track is unseen', 'px/s', 0.0)
     max_gate_px: float = parameter(40.0, 'largest gate', 'px', 0.1)
-    lost_after_s: float = parameter(2.0, 'a track unseen for this long is lost', 's', 0.01)
+    lost_after_s: float = parameter(2.0, 'a track unseen for this long is lost', 's', 0.01, 60.0)
     reacquire_s: float = parameter(
         10.0,
         'motion: what appears so soon where a track of known rate was lost takes its label, unless its rate is another',

@@ -24,7 +24,9 @@ a lower bound.  With the old lower bits a TIME_HIGH that came too early by one w
 *Unwrapping.*  24 bits of µs wrap every 16.777 s.  The unwrapped time starts at the first TIME_HIGH seen: it is below
 2²⁴ µs, whatever the sensor's age.  TIME_HIGH may step back a little; only a large fall is a wrap:
 
-    inside a packet                  a fall by up to 1 s is a step back, any other a wrap (1 packet: 1 to 10 ms)
+    inside a packet                  a fall by up to 1 s is a step back, any other a wrap (1 packet: 1 to 10 ms).  A sensor
+                                     steps on by one; a word that leaps is believed until it is 16.777 s in all, then
+                                     skipped: a few damaged words would make hours of the stream
     first TIME_HIGH of a packet      host time tells how far the sensor should have moved on.  Of the two times that
                                      the bits allow, the one nearer to that is taken.  It is a restart if that is a
                                      step back by more than 1 s, or a wrap that runs ahead of host time by more
@@ -62,6 +64,10 @@ TIME_LOW, CONTINUED_4, TIME_HIGH, EXT_TRIGGER, OTHERS, CONTINUED_12 = 6, 7, 8, 1
 PERIOD_US = 1 << 24
 STEP_BACK_US = 1_000_000
 """Up to here a fall of TIME_HIGH is a step back, and a wrap may differ from host time."""
+LEAP_US = 3 << 12
+"""Inside a packet a TIME_HIGH that steps on by so much leaps."""
+MOST_LEAPT_US = PERIOD_US
+"""By no more do those of a packet leap in all."""
 _VECTOR_MARGIN = 12
 """A vector writes all its columns and then counts those that are events: room behind the last one."""
 _SIGN_SHIFT, _LATE_SHIFT = 12, 13
@@ -77,8 +83,9 @@ _NO_BITS, _HIGH_BITS, _ALL_BITS = range(3)
 """What of the time was seen since the start, or since packets were missing."""
 _NO_ROW = 0xFFFF  # no sensor has it: such events are outside at first
 _NO_BASE = 1 << 40
-# How a packet follows the one before; whether it had a TIME_HIGH yet; whether that told of a restart.
-_ELAPSED_US, _SEQ_FELL, _FOLLOWED, _RESTARTED = range(4)
+# How a packet follows the one before; whether it had a TIME_HIGH yet; whether that told of a restart; by how much its other
+# ones have leapt, and how many were skipped for that.
+_ELAPSED_US, _SEQ_FELL, _FOLLOWED, _RESTARTED, _LEAPT_US, _UNBELIEVED = range(6)
 
 
 class Evt3Decoder:
@@ -86,7 +93,7 @@ class Evt3Decoder:
 
     def __init__(self) -> None:
         self._state = np.zeros(_STATE_SIZE, np.int64)
-        self._link = np.zeros(4, np.int64)
+        self._link = np.zeros(6, np.int64)
         self._state[_HIGH_US] = self._state[_LATEST_US] = _UNKNOWN
         self._forget()
 
@@ -98,7 +105,7 @@ class Evt3Decoder:
         columns = EventColumns(_capacity(words))
         link = self._link
         link[_ELAPSED_US], link[_SEQ_FELL] = continuity.elapsed_ns // 1000, continuity.seq_fell
-        link[_FOLLOWED] = link[_RESTARTED] = 0
+        link[_FOLLOWED:] = 0
         n = _decode(
             words,
             packet.width,
@@ -111,6 +118,7 @@ class Evt3Decoder:
             columns.t_ns,
             tally,
         )
+        tally[SKIPPED] += link[_UNBELIEVED]
         restarted = bool(link[_RESTARTED])
         latest_us = int(self._state[_LATEST_US])
         batch: EventBatch | None = None
@@ -146,7 +154,14 @@ def _follow_high(last_us, high_us, link):  # type: ignore[no-untyped-def]
     forward_us = (high_us - last_us) % PERIOD_US
     back_us = PERIOD_US - forward_us
     if link[_FOLLOWED]:
-        return (last_us - back_us if back_us <= STEP_BACK_US else last_us + forward_us), False
+        if back_us <= STEP_BACK_US:
+            return last_us - back_us, False
+        if forward_us >= LEAP_US:
+            if link[_LEAPT_US] + forward_us > MOST_LEAPT_US:
+                link[_UNBELIEVED] += 1
+                return last_us, False
+            link[_LEAPT_US] += forward_us
+        return last_us + forward_us, False
     elapsed_us = link[_ELAPSED_US]
     seq_fell = link[_SEQ_FELL] != 0
     fell = high_us < last_us % PERIOD_US
@@ -294,7 +309,7 @@ def _decode(words, width, height, state, link, x, y, polarity, t_ns, tally):  # 
         elif word == same_high:
             link[_FOLLOWED] = 1
         elif code == TIME_HIGH:
-            high_us, restarted = _follow_high(high_us, (word & 0xFFF) << 12, link)
+            new_us, restarted = _follow_high(high_us, (word & 0xFFF) << 12, link)
             link[_FOLLOWED] = 1
             if restarted:
                 # What came before belongs to the sensor's life before; so does the state.
@@ -305,8 +320,8 @@ def _decode(words, width, height, state, link, x, y, polarity, t_ns, tally):  # 
                 at = np.uint64(_await_time(words, np.int64(at) - 1, state, link, tally))
                 high_us, low_us, latest_us = state[_HIGH_US], state[_LOW_US], state[_LATEST_US]
                 row, base, sign = np.uint16(state[_ROW]), state[_BASE], state[_POLARITY]
-            else:
-                low_us = np.int64(0)
+            elif new_us != high_us:  # else it is not believed
+                high_us, low_us = new_us, np.int64(0)
             late = np.int64(high_us + low_us < latest_us) << _LATE_SHIFT
             latest_us = max(latest_us, high_us + low_us)
             now_ns = latest_us * 1000

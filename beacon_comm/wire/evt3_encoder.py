@@ -5,8 +5,8 @@ from its own start, as a reader does that lost the packet before.  Three or more
 in columns that rise within 12 px become VECT_BASE_X and VECT_12.
 
 Times are cut to whole µs, of which 24 bits are sent: a reader's unwrapped time is right but for a multiple of
-16.777 s.  A pause is bridged by a TIME_HIGH every second, within a payload and from one to the next, so that a
-reader follows across pauses of any length.
+16.777 s.  A pause is bridged by every TIME_HIGH that a sensor would send, within a payload and from one to the next, so
+that a reader follows across pauses of any length.
 """
 
 from __future__ import annotations
@@ -19,9 +19,7 @@ from beacon_comm.wire.errors import WireError
 from beacon_comm.wire.evt3 import ADDR_X, ADDR_Y, TIME_HIGH, TIME_LOW, VECT_12, VECT_BASE_X
 
 MAX_SIDE_PX = 1 << 11
-MAX_PAUSE_US = 100_000 * 1_000_000
-_BRIDGE_STEP = 244
-"""TIME_HIGH steps (of 4096 µs) in one second: far from both a wrap and a step back."""
+MAX_PAUSE_US = 10_000 * 1_000_000
 _NO_TIME = -1
 
 
@@ -47,7 +45,7 @@ class Evt3Encoder:
             with_end: end with time words for ``t_end_ns``, so that a batch without events moves time on.
 
         Raises:
-            WireError: events outside the sensor, negative times or times out of order, or a pause above 100,000 s.
+            WireError: events outside the sensor, negative times or times out of order, or a pause above 10,000 s.
         """
         t_us = batch.t_ns // 1000
         start_us = int(t_us[0]) if len(batch) else batch.t_end_ns // 1000
@@ -56,7 +54,7 @@ class Evt3Encoder:
         reached = self._reached_us if self._reached_us != _NO_TIME else start_us
         bridged_us = max(end_us, int(t_us[-1]) if len(batch) else start_us) - reached
         # At worst an event needs TIME_HIGH, TIME_LOW, ADDR_Y, ADDR_X; the start and the end need four words.
-        capacity = 4 * len(batch) + 8 + 2 * (bridged_us // (_BRIDGE_STEP << 12) + 1)
+        capacity = 4 * len(batch) + 8 + (bridged_us >> 12) + 1
         words = np.empty(capacity, '<u2')
         n = _encode(batch.x, batch.y, batch.polarity, t_us, reached, start_us, end_us, words)
         self._reached_us = max(end_us, int(t_us[-1]) if len(batch) else start_us)
@@ -75,15 +73,9 @@ class Evt3Encoder:
 
 @njit(cache=True, nogil=True)
 def _move_on(from_us, to_us, words, n):  # type: ignore[no-untyped-def]
-    """Write the time words that lead from one time to another, every second of a pause; return the place reached."""
-    high = from_us >> 12
-    to_high = to_us >> 12
-    while to_high - high > _BRIDGE_STEP:
-        high += _BRIDGE_STEP
+    """Write the time words that lead from one time to another; return the place reached."""
+    for high in range((from_us >> 12) + 1, (to_us >> 12) + 1):
         words[n] = TIME_HIGH << 12 | (high & 0xFFF)
-        n += 1
-    if to_high != high:
-        words[n] = TIME_HIGH << 12 | (to_high & 0xFFF)
         n += 1
     words[n] = TIME_LOW << 12 | (to_us & 0xFFF)
     return n + 1
