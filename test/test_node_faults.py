@@ -156,3 +156,21 @@ def test_a_day_of_faults(peer: Peer, node: NodeProcess) -> None:
     assert node.exit_code() == 0, node.output()
     assert 'Traceback' not in node.output()
     assert day.count('internal_errors') == 0
+
+
+def test_a_clock_of_negative_time_ends_no_node(peer: Peer, node: NodeProcess) -> None:
+    day = Day(peer)
+    node.wait_for(f'waiting for events on {TOPIC}')
+    peer.advertise(EventPacket, TOPIC, ReliabilityPolicy.BEST_EFFORT)
+    assert peer.spin_until(peer.publisher.get_subscription_count), node.output()
+    assert peer.spin_until(lambda: peer.node.count_publishers('/beacon_node/characters'))
+    stream = packets(beacon_events(2 * TEXT))
+    day.publish(stream[:20])
+    day.tick(-day.now_ns - 5 * NS_PER_S)
+    assert peer.spin_until(lambda: day.count('internal_errors') > 0), node.output()
+    day.tick(STAMP_NS - day.now_ns)
+    before = len(day.text())
+    day.publish(stream[20:])
+    assert day.reads("to a summer's day", before), (day.text(), node.output())
+    node.process.send_signal(signal.SIGINT)
+    assert node.exit_code() == 0, node.output()

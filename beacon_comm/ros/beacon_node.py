@@ -70,9 +70,7 @@ def guarded(callback: Callable[..., None]) -> Callable[..., None]:
         try:
             callback(self, *args)
         except Exception:
-            self.report.totals['internal_errors'] += 1
-            with suppress(Exception):
-                self.log_error('internal', f'in {callback.__name__}: {traceback.format_exc()}', time.monotonic_ns())
+            self.survive(callback.__name__)
 
     return run
 
@@ -125,6 +123,12 @@ class BeaconNode(Node):
         self._make_inputs()
         self._publish_confirmed()
         self.get_logger().info(f'waiting for events on {self._topic}')
+
+    def survive(self, where: str) -> None:
+        """Count and log the exception that is being handled, and go on."""
+        self.report.totals['internal_errors'] += 1
+        with suppress(Exception):
+            self.log_error('internal', f'in {where}: {traceback.format_exc()}', time.monotonic_ns())
 
     @guarded
     def _warm_up(self) -> None:
@@ -305,7 +309,7 @@ class BeaconNode(Node):
     def _on_report(self) -> None:
         traffic, events, values = self.report.look(self._live, time.monotonic_ns())
         if traffic.only_refused and self._only_refused:
-            self.get_logger().warning(f'{self._live.frame_id} is gone from {self._topic}: reading the other camera')
+            self.get_logger().warning(f'{self._live.frame_id!r} is gone from {self._topic}: reading the other camera')
             self._open_stream()
         self._only_refused = traffic.only_refused
         unsubscribed = self._type not in self._found.types

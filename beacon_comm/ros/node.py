@@ -79,7 +79,12 @@ def _run(args: Sequence[str] | None, stop: StopSignal) -> int:
         gc.collect()
         gc.freeze()  # what stays for good, the compiler's above all, need not be gone through again: a tenth of a second
         while rclpy.ok() and not stop.requested:
-            executor.spin_once()  # the node's timers bound the wait
+            try:
+                executor.spin_once()  # the node's timers bound the wait
+            except ExternalShutdownException:
+                raise
+            except Exception:
+                node.survive('spin_once')  # a /clock of negative time, for one, is rclpy's own business
     except BeaconCommError as error:
         rclpy.logging.get_logger(NODE_NAME).fatal(str(error))
         return EXIT_REFUSED
