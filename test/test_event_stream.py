@@ -119,10 +119,21 @@ def test_an_array_has_no_seq_and_is_told_of_losses() -> None:
     assert stream.push(build_event_array(9, 'cam', 346, 260, *later)).batch.missing_until_ns == 2**40 + 1000
     stream.shed()
     assert stream.push(build_event_array(9, 'cam', 346, 260, *later)).batch.missing_until_ns is not None
+    stream.push(build_event_array(9, 'cam', 0, 260, *later))  # what cannot be read is missing, too
+    assert stream.push(build_event_array(9, 'cam', 346, 260, *later)).batch.missing_until_ns is not None
+    stream.push(build_event_array(9, 'another', 346, 260, *later))
+    assert stream.push(build_event_array(9, 'cam', 346, 260, *later)).batch.missing_until_ns is None
     packets = EventStream(PACKET)
     packets.push(nth(1))
     packets.lost()
     assert packets.push(nth(2)).batch.missing_until_ns is None
+
+
+@pytest.mark.parametrize('name', ['frame_id', 'encoding'])
+def test_no_text_fills_the_log(name: str) -> None:
+    decoded = EventStream(PACKET).push(packet(b'', **{name: 'a' * 1_000_000}))
+    assert decoded.problem == f'{name} of 1000001 bytes: 256 at most'
+    assert decoded.problem_kind == 'bad_messages' and decoded.frame_id == ''
 
 
 def test_a_packet_that_comes_twice_is_read_once() -> None:
@@ -130,6 +141,10 @@ def test_a_packet_that_comes_twice_is_read_once() -> None:
     for n in (1, 2, 2, 3):
         stream.push(nth(n))
     assert (noticed(stream), stream.counts['events']) == ({'repeated_packets': 1}, 3)
+    often = EventStream(PACKET)
+    for n in (1, 2, 2, 2, 2, 2, 3):
+        often.push(nth(n))
+    assert (noticed(often), often.counts['events']) == ({'repeated_packets': 4}, 3)
     # A driver that numbers nothing and stamps nothing repeats nothing.
     silent = EventStream(PACKET)
     for n in range(5):

@@ -36,6 +36,7 @@ EVENT_STRIDE_BYTES = 16
 LAST_EVENT_BYTES = 13
 """An Event is 13 bytes; the next one's x follows after one byte of padding, two before the stride's boundary."""
 MAX_TIME_BASE_NS = 1 << 62
+MOST_TEXT_BYTES = 256
 
 _STAMP_AND_LENGTH = struct.Struct('<iII')
 _SIZE = struct.Struct('<II')
@@ -120,7 +121,7 @@ def parse_event_array(cdr: Bytes) -> ArrayPacket:
     """Read an EventArray of the shape of ``dvs_msgs/msg/EventArray``.
 
     Raises:
-        WireError: the bytes are too short for what they announce, or not little-endian CDR.
+        WireError: the bytes are too short for what they announce, not little-endian CDR, or a text is too long.
     """
     view = _contents(cdr)
     stamp_ns, frame_id, height, width, at = _header_and_size(view)
@@ -207,6 +208,8 @@ def _header_and_size(view: memoryview) -> tuple[int, str, int, int, int]:
 
 def _string(view: memoryview, at: int, length: int, name: str) -> tuple[str, int]:
     _need(view, at + length, name)
+    if length > MOST_TEXT_BYTES:
+        raise WireError('text', f'{name} of {length} bytes: {MOST_TEXT_BYTES} at most')
     return bytes(view[at : at + length]).rstrip(b'\x00').decode('utf-8', 'replace'), at + length
 
 

@@ -4,7 +4,7 @@
 
 *Order of packets.*  A step of seq by more than one tells of lost packets; the batch that follows says up to where the
 stream is missing.  A packet of a seq up to ``MOST_LATE`` back whose stamp is not newer was overtaken by others: it is
-passed over, like one that comes twice.  A third one in a row is the beginning of a recording played again, or of a
+passed over, like one that comes again.  A third one in a row is the beginning of a recording played again, or of a
 driver started again.
 
 Everything that can be wrong with a message is counted by kind in :attr:`EventStream.counts` and named in
@@ -159,7 +159,7 @@ class EventStream:
         self._missing = True
 
     def lost(self) -> None:
-        """Hear from the middleware that messages were lost; packets know better, by their seq."""
+        """Hear that messages were lost, or could not be read; packets know better, by their seq."""
         self._missing |= self._is_array
 
     def push(self, cdr: Bytes) -> Decoded:
@@ -197,10 +197,10 @@ class EventStream:
         last = self._last
         if last is None or last.seq is None or packet.seq is None or packet.encoding != last.encoding:
             return None
-        kind = None
         if packet.seq == last.seq and packet.stamp_ns == last.stamp_ns and np.array_equal(packet.payload, last.payload):
-            kind = 'repeated_packets'
-        elif last.seq - MOST_LATE <= packet.seq < last.seq and packet.stamp_ns <= last.stamp_ns:
+            return 'repeated_packets'
+        kind = None
+        if last.seq - MOST_LATE <= packet.seq < last.seq and packet.stamp_ns <= last.stamp_ns:
             kind = 'overtaken_packets'
         if kind is not None and self._late_in_a_row == LATE_IN_A_ROW:
             kind = None
@@ -209,6 +209,8 @@ class EventStream:
 
     def _problem(self, packet: Packet | ArrayPacket | None, kind: str, text: str) -> Decoded:
         self._counts[kind] += 1
+        if kind != 'refused_frames':
+            self.lost()
         if packet is None:
             return Decoded(None, 0, '', 0, 0, problem=text, problem_kind=kind)
         return Decoded(
