@@ -3,6 +3,7 @@
 import json
 import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -406,6 +407,15 @@ def test_cut_batches_are_the_batch(steps, tail, grid_ns, reached_ns) -> None:
     assert all(
         not len(after) or after.t_ns[0] >= before.t_end_ns for before, after in zip(parts[:-1], parts[1:], strict=True)
     )
+
+
+def test_a_missing_stretch_is_not_cut() -> None:
+    t_ns = np.array([1250, 1260, 1330])
+    x = np.arange(3, dtype=np.uint16)
+    parts = list(cut_batch(EventBatch(x, x, np.ones(3, np.int8), t_ns, 1350, missing_until_ns=1250), 100, 1010))
+    assert [(len(part), part.t_end_ns, part.missing_until_ns) for part in parts] == [(2, 1300, 1250), (1, 1350, None)]
+    (part,) = cut_batch(replace(EventBatch.empty(1350), missing_until_ns=1350), 100, 1010)
+    assert part.missing_until_ns == part.t_end_ns == 1350
 
 
 def test_events_near_a_path() -> None:

@@ -6,12 +6,29 @@ Other faults have their tests where they are dealt with: docs/robustness.md list
 from __future__ import annotations
 
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
-from live_session import BIT_RATE, MS, PACKET_NS, STAMP_NS, START_NS, TEXT, Heard, Session, beacon_events, packets, spared
+from live_session import (
+    BIT_RATE,
+    MS,
+    PACKET_NS,
+    STAMP_NS,
+    START_NS,
+    TEXT,
+    TYPE,
+    Heard,
+    Session,
+    beacon_events,
+    packets,
+    spared,
+)
 
+from beacon_comm.cli.offline import Options, evaluate_recording
 from beacon_comm.core.events import EventBatch
+from beacon_comm.core.parameters import Parameters
+from beacon_comm.recordings.bag_writer import BagWriter
 from beacon_comm.recordings.disc import Disc
 from beacon_comm.simulation.led import simulate_text
 from beacon_comm.wire.cdr import build_event_packet
@@ -75,6 +92,27 @@ def test_five_percent_lost(receiver: str, bit_rate: float, seed: int) -> None:
     run = Run(receiver, bit_rate, seed)
     counts = run.check([message for k, message in enumerate(run.stream) if k not in run.chosen], run.chosen)
     assert counts['lost_packets'] == len(run.chosen) > 5
+
+
+@pytest.mark.parametrize('receiver', RECEIVERS)
+def test_a_lossy_bag_is_read_as_it_was_live(receiver: str, tmp_path: Path) -> None:
+    """Lost from the beginning on, some next to one another, and once many."""
+    events = simulated(3 * TEXT, BIT_RATE, 5)
+    random = np.random.default_rng(5)
+    stream = [message for k, message in enumerate(packets(events)) if not 80 <= k < 92 and random.random() >= SHARE]
+    session = Session(receiver=receiver)
+    session.push(stream)
+    session.steps.append(session.live.flush(session.now_ns))
+    with BagWriter(tmp_path / 'bag') as writer:
+        writer.add_topic('/events', TYPE)
+        for k, message in enumerate(stream):
+            writer.write('/events', STAMP_NS + k * PACKET_NS, message)
+    parameters = Parameters(bit_rates=(BIT_RATE,), receiver=receiver)
+    (beacon,) = evaluate_recording(str(tmp_path / 'bag'), Options(parameters)).beacons
+    first_ns = int(events.t_ns[0])
+    heard = [(one.at.sensor_ns - first_ns, one.character.code, one.character.status) for one in session.characters()]
+    assert len(heard) > len(3 * TEXT) // 2
+    assert [(one.t_ns, one.code, one.status) for one in beacon.characters] == heard
 
 
 @pytest.mark.parametrize('receiver', [SEQUENCE, THRESHOLD])

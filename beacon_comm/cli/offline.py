@@ -230,9 +230,14 @@ def _receive(
 
 
 def cut_batch(batch: EventBatch, grid_ns: int, reached_ns: int | None) -> Iterator[EventBatch]:
-    """Cut a batch at multiples of ``grid_ns`` of the sensor's time, from ``reached_ns`` (None: its first event) on."""
+    """Cut a batch at multiples of ``grid_ns`` of the sensor's time, from ``reached_ns`` (None: its first event) on.
+
+    A missing stretch stays whole: live, it is told of at once, too.
+    """
     if reached_ns is None:
         reached_ns = int(batch.t_ns[0]) if len(batch) else batch.t_end_ns
+    if batch.missing_until_ns is not None:
+        reached_ns = max(reached_ns, batch.missing_until_ns)
     # A leap in time is not followed step by step.
     reached_ns = max(reached_ns, batch.t_end_ns - LONGEST_SAMPLED_NS)
     start = 0

@@ -33,7 +33,8 @@ class EventBatch:
         polarity: +1 for a rise, -1 for a fall of brightness, ``(n,)`` int8.
         t_ns: sensor time (ns), non-decreasing, ``(n,)`` int64.
         t_end_ns: the stream's time (ns) after this batch; see the module's head.
-        missing_until_ns: end of the missing stretch before this batch (ns), at most ``t_end_ns``; None without one.
+        missing_until_ns: end of the missing stretch before this batch (ns), at most ``t_end_ns`` and no later than the first
+            event; None without one.
         carried_on: see the module's head.
     """
 
@@ -56,7 +57,16 @@ class EventBatch:
         )
 
     def slice(self, start: int, stop: int, t_end_ns: int) -> EventBatch:
-        """Return events ``start:stop`` as views, with the stream's time ``t_end_ns`` (ns)."""
+        """Return events ``start:stop`` as views, with the stream's time ``t_end_ns`` (ns).
+
+        What is missing before the batch is missing before a slice from its first event on, up to ``t_end_ns``.
+        """
+        missing_ns = self.missing_until_ns if start == 0 else None
         return EventBatch(
-            self.x[start:stop], self.y[start:stop], self.polarity[start:stop], self.t_ns[start:stop], t_end_ns
+            self.x[start:stop],
+            self.y[start:stop],
+            self.polarity[start:stop],
+            self.t_ns[start:stop],
+            t_end_ns,
+            None if missing_ns is None else min(missing_ns, t_end_ns),
         )
