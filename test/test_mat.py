@@ -44,6 +44,8 @@ def test_real_recording(data_folder: Path) -> None:
         ({'event': np.empty((1, 0)), 'event_t': np.empty((1, 0))}, 'no events'),
         ({'event': [[1, 1]], 'event_t': [[1.0, np.nan]]}, 'not finite'),
         ({'event': [[1, 1, 1]], 'event_t': [[1.0, 3.0, 2.0]]}, 'steps back at event 2'),
+        ({'event': [[1, 1, -1]], 'event_t': [[1.0, 3.0, 1e9]]}, 'spans 1e\\+09 s, more than a day .*in seconds'),
+        ({'event': [[1, -1]], 'event_t': [[98.0, 110_000.0]]}, 'spans 109902 s, more than a day .*in seconds'),
     ],
 )
 def test_wrong_variables_are_refused(tmp_path: Path, variables: dict[str, object], reason: str) -> None:

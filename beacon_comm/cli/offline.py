@@ -11,6 +11,7 @@ All times of the results are recording time: ns since the recording's first even
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -137,13 +138,13 @@ def receive_signal(
     receiver = SignalReceiver(parameters)
     collector = Collector()
     last_ns = int(t_ns[-1])
-    cuts_ns = [*range(int(t_ns[0]) + MAT_BATCH_NS, last_ns, MAT_BATCH_NS), last_ns]
-    stops = [*(int(stop) for stop in np.searchsorted(t_ns, cuts_ns[:-1])), len(t_ns)]
-    pieces: Iterable[tuple[int, int]] = zip(cuts_ns, stops, strict=True)
+    cuts_ns = range(int(t_ns[0]) + MAT_BATCH_NS, last_ns, MAT_BATCH_NS)
+    cuts: Iterable[int] = itertools.chain(cuts_ns, [last_ns])
     if title is not None:
-        pieces = progress(pieces, title, len(cuts_ns))
+        cuts = progress(cuts, title, len(cuts_ns) + 1)
     start = 0
-    for cut_ns, stop in pieces:
+    for cut_ns in cuts:
+        stop = len(t_ns) if cut_ns == last_ns else int(np.searchsorted(t_ns, cut_ns))
         collector.take(receiver.push_signal(t_ns[start:stop], polarity[start:stop], cut_ns), receiver)
         start = stop
     collector.take(receiver.flush(), receiver)
