@@ -6,10 +6,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from beacon_comm.core.errors import ParameterError
 from beacon_comm.core.parameters import Parameters, declarations, from_mapping
+from beacon_comm.core.yaml_text import load_yaml
 
 
 def add_parameter_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,8 +38,8 @@ def parameters_from(arguments: argparse.Namespace) -> tuple[Parameters, list[str
         if not equals:
             raise ParameterError(f'--set {setting}: must be NAME=VALUE')
         try:
-            values[name.strip()] = yaml.safe_load(text)
-        except yaml.YAMLError as error:
+            values[name.strip()] = load_yaml(text)
+        except ValueError as error:
             raise ParameterError(f'--set {setting}: {text!r} is no value') from error
     if arguments.receiver is not None:
         values['receiver'] = arguments.receiver
@@ -61,11 +60,11 @@ def _rates(text: str) -> list[float]:
 def _from_file(path: Path) -> tuple[dict[str, Any], list[str]]:
     """Read a flat YAML mapping, or a ROS parameter file: there, names that are not the receiver's are the node's."""
     try:
-        content = yaml.safe_load(path.read_text(encoding='utf-8'))
+        content = load_yaml(path.read_text(encoding='utf-8'))
     except (OSError, UnicodeDecodeError) as error:
         raise ParameterError(f'{path}: cannot be read ({getattr(error, "strerror", None) or error})') from error
-    except yaml.YAMLError as error:
-        raise ParameterError(f'{path}: no YAML ({" ".join(str(error).split())})') from error
+    except ValueError as error:
+        raise ParameterError(f'{path}: no YAML ({error})') from error
     content = {} if content is None else content
     if not isinstance(content, dict):
         raise ParameterError(f'{path}: not a mapping of parameters')

@@ -22,10 +22,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 from numpy.typing import ArrayLike, NDArray
 
 from beacon_comm.core.errors import CalibrationError
+from beacon_comm.core.yaml_text import load_yaml
 
 Floats = NDArray[np.float64]
 
@@ -69,8 +69,8 @@ class CameraModel:
             CalibrationError: the file cannot be read, or a field is missing or wrong; the text names file and field.
         """
         try:
-            content = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            content = load_yaml(Path(path).read_text(encoding='utf-8'))
+        except (OSError, ValueError) as error:
             raise CalibrationError(f'{path}: {error}') from error
         try:
             if not isinstance(content, Mapping):

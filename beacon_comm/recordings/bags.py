@@ -16,9 +16,8 @@ from collections.abc import Iterator
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 
-import yaml
-
 from beacon_comm.core.errors import RecordingError
+from beacon_comm.core.yaml_text import load_yaml
 from beacon_comm.recordings.interfaces import is_event_type
 from beacon_comm.recordings.storage import Message, TopicInfo, file_messages, file_topics
 
@@ -161,11 +160,11 @@ def open_recording(path: str | Path) -> Bag:
 
 def _listed_files(folder: Path) -> list[Path]:
     try:
-        metadata = yaml.safe_load((folder / 'metadata.yaml').read_text())
+        metadata = load_yaml((folder / 'metadata.yaml').read_text())
         names = metadata['rosbag2_bagfile_information']['relative_file_paths']
         # Old bags list names with their folder in front.
         return [folder / PurePath(name).name for name in names]
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError):
         return []
 
 

@@ -184,7 +184,7 @@ def read_truth(path: str | Path) -> SceneTruth:
     file = path / TRUTH_NAME if path.is_dir() else path
     try:
         content = json.loads(file.read_text(encoding='utf-8'))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise RecordingError(f'{file}: cannot be read ({error})') from error
     try:
         if content['schema'] == _SCHEMA:

@@ -20,10 +20,9 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from beacon_comm.core.errors import ParameterError, RecordingError
 from beacon_comm.core.framing import CharacterFrame
+from beacon_comm.core.yaml_text import load_yaml
 from beacon_comm.simulation.keys import (
     key,
     list_of,
@@ -416,11 +415,11 @@ def read_description(
         ParameterError: no YAML, or a wrong key or value; the text names file and key.
     """
     try:
-        content = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+        content = load_yaml(Path(path).read_text(encoding='utf-8'))
     except (OSError, UnicodeDecodeError) as error:
         raise RecordingError(f'{path}: cannot be read ({getattr(error, "strerror", None) or error})') from error
-    except yaml.YAMLError as error:
-        raise ParameterError(f'{path}: no YAML ({" ".join(str(error).split())})') from error
+    except ValueError as error:
+        raise ParameterError(f'{path}: no YAML ({error})') from error
     try:
         return make_description(content, load_text), content
     except ParameterError as error:
