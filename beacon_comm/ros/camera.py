@@ -16,9 +16,12 @@ def resolve_url(url: str) -> Path:
     """Return the file of a path, a ``file://`` URL or a ``package://name/path`` URL.
 
     Raises:
-        CalibrationError: another scheme, or a package that is not installed.
+        CalibrationError: no URL, another scheme, or a package that is not installed.
     """
-    parts = urlparse(url)
+    try:
+        parts = urlparse(url)
+    except ValueError as error:
+        raise CalibrationError(f'{url}: {error}') from error
     if parts.scheme == '':
         return Path(url).expanduser()
     if parts.scheme == 'file':
