@@ -292,6 +292,8 @@ def test_what_is_no_bag_is_refused(tmp_path: Path) -> None:
     (tmp_path / 'a.txt').write_text('text')
     with pytest.raises(RecordingError, match=r'a\.txt: not a bag'):
         open_recording(tmp_path / 'a.txt')
+    with pytest.raises(RecordingError, match='/dev/null: not a bag'):
+        open_recording('/dev/null')
     (tmp_path / 'empty').mkdir()
     with pytest.raises(RecordingError, match=r'no \.mcap or \.db3 file'):
         open_recording(tmp_path / 'empty')

@@ -343,7 +343,11 @@ def test_a_refused_json_file_costs_no_evaluation(mat_file, capsys, tmp_path) -> 
         (('x.mat', '--camera', str(PROJECT / 'setup.cfg')), f'--camera {PROJECT / "setup.cfg"}: '),
         (('x.mat', '--json', '/absent/out.json'), '--json /absent/out.json: cannot be written (no such folder)'),
         (('x.mat', '--json', str(PROJECT)), f'--json {PROJECT}: cannot be written (is a folder)'),
-        (('x.mat', '--duration', '-1'), '--duration'),
+        (('x.mat', '--duration', '-1'), '--duration -1: must be above 0'),
+        (('x.mat', '--duration', 'nan'), '--duration nan: must be above 0'),
+        (('x.mat', '--duration', '1e300'), '--duration 1e+300: must be above 0, at most 1e+09 s'),
+        (('x.mat', '--start', 'nan'), '--start nan: must be from 0'),
+        (('x.mat', '--start', '1e300'), '--start 1e+300: must be from 0 to 1e+09 s'),
     ],
 )
 def test_errors_are_one_line_and_exit_code_2(capsys, arguments, complaint) -> None:

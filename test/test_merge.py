@@ -65,7 +65,7 @@ def test_clip_parse() -> None:
     assert Clip.parse('0') == Clip()
     assert Clip.parse('12.3,5') == Clip(12.3, 5.0)
     assert Clip.parse('1,,3') == Clip(1.0, None, 3)
-    for text in ('', 'a', '1,2,3,4', '-1', '1,0', '1,-2', '1,2,0', 'inf', '0,nan'):
+    for text in ('', 'a', '1,2,3,4', '-1', '1,0', '1,-2', '1,2,0', 'inf', '0,nan', '1e300', '0,1e300'):
         with pytest.raises(ParameterError, match='clip'):
             Clip.parse(text)
 
@@ -81,6 +81,12 @@ def test_clip_places_the_part_at_scene_time_0() -> None:
     assert times.tolist() == [0, NS_PER_S, period, period + NS_PER_S]
     assert its_polarity.tolist() == [1, -1, 1, -1] and end_ns == 2 * period
     assert len(Clip(10.0).apply(t_ns, polarity)[0]) == 0
+
+
+@pytest.mark.parametrize('clip', [Clip(0.0, 1.0, 86_401), Clip(0.0, 1e-9, 1 << 29), Clip(0.0, 1e-10, 10**30)])
+def test_a_clip_is_not_repeated_without_end(clip: Clip) -> None:
+    with pytest.raises(ParameterError, match=f'clip count {clip.count}: more than a day'):
+        clip.apply(np.array([0, 1000], np.int64), np.array([1, -1], np.int8))
 
 
 def test_background_loops_without_a_step_back(background_bag: Path) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from beacon_comm.cli.parameter_arguments import add_parameter_arguments, parameters_from
-from beacon_comm.cli.parser import EXIT_ERROR, EXIT_OK, OneLineParser
+from beacon_comm.cli.parser import EXIT_ERROR, EXIT_OK, LONGEST_S, OneLineParser
 from beacon_comm.core.errors import BeaconCommError, CalibrationError, ParameterError, RecordingError
 from beacon_comm.core.framing import CharacterFrame
 from beacon_comm.core.parameters import Parameters
@@ -102,8 +102,10 @@ def _run(arguments: argparse.Namespace, words: Sequence[str]) -> int:
     from beacon_comm.cli.offline import Options, evaluate_recording, is_mat
     from beacon_comm.compiling.warm_up import warm_up
 
-    if arguments.start < 0.0 or (arguments.duration is not None and arguments.duration <= 0.0):
-        raise RecordingError('--start must not be negative, --duration must be more than 0')
+    if not 0.0 <= arguments.start <= LONGEST_S:
+        raise ParameterError(f'--start {arguments.start:g}: must be from 0 to {LONGEST_S:g} s')
+    if arguments.duration is not None and not 0.0 < arguments.duration <= LONGEST_S:
+        raise ParameterError(f'--duration {arguments.duration:g}: must be above 0, at most {LONGEST_S:g} s')
     _check_writable(arguments.json)
     receivers = [None] if arguments.receiver is None else arguments.receiver.split(',')
     settings: dict[str, Parameters] = {}

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from beacon_comm.cli.interrupts import ignore_interrupts
-from beacon_comm.cli.parser import EXIT_ERROR, OneLineParser
+from beacon_comm.cli.parser import EXIT_ERROR, LONGEST_S, OneLineParser
 from beacon_comm.core.errors import BeaconCommError, ParameterError
 
 EVENT_TOPIC = '/event_camera/events'
@@ -104,12 +104,15 @@ def _size(text: str) -> tuple[int, int]:
 
 def _check(options: argparse.Namespace) -> None:
     for name in ('rate', 'start', 'wait_subscribers'):
-        if not 0.0 <= getattr(options, name) < float('inf'):
-            raise ParameterError(f'--{name.replace("_", "-")} {getattr(options, name):g}: must be 0 or more')
+        value = getattr(options, name)
+        if not 0.0 <= value <= LONGEST_S:
+            raise ParameterError(f'--{name.replace("_", "-")} {value:g}: must be 0 or more, at most {LONGEST_S:g}')
     for name in ('duration', 'packet_period'):
         value = getattr(options, name)
-        if value is not None and not 0.0 < value < float('inf'):
-            raise ParameterError(f'--{name.replace("_", "-")} {value:g}: must be above 0')
+        if value is not None and not 0.0 < value <= LONGEST_S:
+            raise ParameterError(f'--{name.replace("_", "-")} {value:g}: must be above 0, at most {LONGEST_S:g}')
+    if options.seed < 0:
+        raise ParameterError(f'--seed {options.seed}: must be 0 or more')
     if options.write is not None and options.loop:
         raise ParameterError('--write with --loop would never end; --duration or the count of a --clip say how long')
     mats = [path.suffix == '.mat' for path in options.recordings]

@@ -116,7 +116,7 @@ class Bag:
     def _storage_files(self) -> list[Path]:
         if not self.path.exists():
             raise RecordingError(f'{self.path}: no such file or folder')
-        if self.path.is_file():
+        if not self.path.is_dir():
             if self.path.suffix not in BAG_SUFFIXES:
                 raise RecordingError(f'{self.path}: not a bag ({", ".join(BAG_SUFFIXES)} or a rosbag2 folder)')
             return [self.path]

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,10 +17,11 @@ from beacon_comm.core.errors import ParameterError, RecordingError
 from beacon_comm.core.events import NS_PER_S, EventBatch
 from beacon_comm.recordings.bags import open_recording
 from beacon_comm.recordings.disc import Disc
-from beacon_comm.recordings.mat import read_mat
+from beacon_comm.recordings.mat import LONGEST_S, read_mat
 from beacon_comm.wire.stream import EventStream
 
 _REPEAT_GRID_NS = 1_000_000
+_MOST_EVENTS = 1 << 28
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class Clip:
     its end), ``count`` times in a row.
 
     Raises:
-        ParameterError: a negative start, no duration, or no count.
+        ParameterError: a start or duration that is not between 0 s and a day, or no count.
     """
 
     start_s: float = 0.0
@@ -38,10 +38,10 @@ class Clip:
     count: int = 1
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.start_s) and self.start_s >= 0.0):
-            raise ParameterError(f'clip start {self.start_s:g}: must be 0 s or more')
-        if self.duration_s is not None and not (math.isfinite(self.duration_s) and self.duration_s > 0.0):
-            raise ParameterError(f'clip duration {self.duration_s:g}: must be above 0 s')
+        if not 0.0 <= self.start_s <= LONGEST_S:
+            raise ParameterError(f'clip start {self.start_s:g}: must be 0 s or more, at most a day')
+        if self.duration_s is not None and not 0.0 < self.duration_s <= LONGEST_S:
+            raise ParameterError(f'clip duration {self.duration_s:g}: must be above 0 s, at most a day')
         if self.count < 1:
             raise ParameterError(f'clip count {self.count}: must be at least 1')
 
@@ -74,6 +74,9 @@ class Clip:
         Args:
             t_ns: times of the recording (ns, non-decreasing), ``(n,)`` int64.
             polarity: ``(n,)`` int8.
+
+        Raises:
+            ParameterError: repeated, it is longer than a day, or of too many events.
         """
         since_start = t_ns - (t_ns[0] if len(t_ns) else 0) - round(self.start_s * NS_PER_S)
         if self.duration_s is not None:
@@ -83,6 +86,9 @@ class Clip:
             period = max(-(-(last + 1) // _REPEAT_GRID_NS) * _REPEAT_GRID_NS, 0)
         first, stop = np.searchsorted(since_start, [0, period])
         once, its_polarity = since_start[first:stop], polarity[first:stop]
+        longest_ns = LONGEST_S * NS_PER_S
+        if self.count > 1 and (self.count * period > longest_ns or self.count * max(1, len(once)) > _MOST_EVENTS):
+            raise ParameterError(f'clip count {self.count}: more than a day, or than {_MOST_EVENTS} events')
         times = np.concatenate([once + k * period for k in range(self.count)])
         return times, np.tile(its_polarity, self.count), period * self.count
 
