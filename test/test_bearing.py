@@ -137,6 +137,7 @@ def without(name: str) -> dict:
             CALIBRATION | {'distortion_coefficients': {'rows': 1, 'cols': 5, 'data': [math.nan] * 5}},
             'distortion_coefficients.data: must be finite',
         ),
+        (CALIBRATION | {'distortion_model': 4_000_000 * 'x'}, f"distortion_model = '{38 * 'x'}…: must be one of"),
         ('only text', 'not a calibration file'),
     ],
 )

@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from beacon_comm.core.errors import CalibrationError
+from beacon_comm.core.errors import CalibrationError, quoted
 from beacon_comm.core.yaml_text import load_yaml
 
 Floats = NDArray[np.float64]
@@ -193,7 +193,7 @@ def _fisheye_vectors(pixels: Floats, k: Floats, d: Floats) -> Floats:
 
 def _coefficients(distortion_model: object, d: ArrayLike) -> Floats:
     if not isinstance(distortion_model, str) or distortion_model not in _COEFFICIENTS:
-        raise CalibrationError(f'distortion_model = {distortion_model!r}: must be one of {", ".join(_COEFFICIENTS)}')
+        raise CalibrationError(f'distortion_model = {quoted(distortion_model)}: must be one of {", ".join(_COEFFICIENTS)}')
     counts = _COEFFICIENTS[distortion_model]
     coefficients = _numbers('distortion_coefficients', d, None)
     if len(coefficients) not in counts:
@@ -206,7 +206,7 @@ def _coefficients(distortion_model: object, d: ArrayLike) -> Floats:
 
 def _size(name: str, value: object) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or value <= 0:
-        raise CalibrationError(f'{name} = {value!r}: must be a positive whole number')
+        raise CalibrationError(f'{name} = {quoted(value)}: must be a positive whole number')
     return value
 
 

@@ -1,4 +1,13 @@
-"""The package's one family of errors: everything raised on purpose derives from BeaconCommError."""
+"""The package's one family of errors: everything raised on purpose derives from BeaconCommError; and how they quote."""
+
+
+MOST_QUOTED = 40
+
+
+def quoted(value: object) -> str:
+    """Return a value as an error shows it: in quotes if it is text, cut off where it is long."""
+    text = repr(value)
+    return text if len(text) <= MOST_QUOTED else text[: MOST_QUOTED - 1] + '…'
 
 
 class BeaconCommError(Exception):

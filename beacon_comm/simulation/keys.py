@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, field, fields
 from typing import Any, TypeVar
 
-from beacon_comm.core.errors import ParameterError
+from beacon_comm.core.errors import ParameterError, quoted
 
 T = TypeVar('T')
 Reader = Callable[[Any, str], Any]
@@ -45,12 +45,7 @@ def key(
 
 def wrong(path: str, value: object, must: str) -> ParameterError:
     """Return the error for a value at a path."""
-    return ParameterError(f'{path} = {_short(value)}: must be {must}')
-
-
-def _short(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + '…'
+    return ParameterError(f'{path} = {quoted(value)}: must be {must}')
 
 
 def number(value: Any, path: str) -> float:
@@ -204,7 +199,7 @@ def read_value(one: Field[Any], value: Any, path: str) -> Any:
     low, high = one.metadata['low'], one.metadata['high']
     for single in flat(read):
         if isinstance(single, (int, float)) and not low <= single <= high:
-            raise ParameterError(f'{path} = {_short(value)}: must lie in [{low:g}, {high:g}]')
+            raise ParameterError(f'{path} = {quoted(value)}: must lie in [{low:g}, {high:g}]')
     return read
 
 
