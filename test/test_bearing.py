@@ -119,6 +119,13 @@ def without(name: str) -> dict:
     return {key: value for key, value in CALIBRATION.items() if key != name}
 
 
+def with_data(name: str, data: list[float], cols: int | None = None) -> dict:
+    return {name: CALIBRATION[name] | {'data': data, 'cols': cols or CALIBRATION[name]['cols']}}
+
+
+NO_DIRECTION = "pixels in the image's middle have no direction"
+
+
 @pytest.mark.parametrize(
     ('content', 'named'),
     [
@@ -138,6 +145,11 @@ def without(name: str) -> dict:
             'distortion_coefficients.data: must be finite',
         ),
         (CALIBRATION | {'distortion_model': 4_000_000 * 'x'}, f"distortion_model = '{38 * 'x'}…: must be one of"),
+        (CALIBRATION | with_data('distortion_coefficients', [1e300] * 5), NO_DIRECTION),
+        (CALIBRATION | with_data('distortion_coefficients', [0.0, 1e9, 0.0, 0.0, 0.0]), NO_DIRECTION),
+        (CALIBRATION | {'distortion_model': 'fisheye'} | with_data('distortion_coefficients', [1e300] * 4, 4), NO_DIRECTION),
+        (CALIBRATION | with_data('camera_matrix', [1e-320, *K[1:]]), NO_DIRECTION),
+        (CALIBRATION | with_data('camera_matrix', [*K[:5], 1e300, *K[6:]]), NO_DIRECTION),
         ('only text', 'not a calibration file'),
     ],
 )

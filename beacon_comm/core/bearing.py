@@ -34,6 +34,7 @@ _STEP_PX = 0.01  # of the Jacobian's central difference: far above rounding, far
 _NEWTON_STEPS = 8
 _SOLVED_PX = 1e-3  # a solution projects back this close
 _EXACT_PX = 1e-9
+_NEAR = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)]) * 0.05  # of the width, around the principal point
 _PLANE_STEP = 1e-6
 _PLANE_STEPS = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)]) * _PLANE_STEP
 
@@ -46,6 +47,9 @@ class CameraModel:
         distortion_model: 'plumb_bob', 'rational_polynomial', 'equidistant' or 'fisheye' (the last two are one).
         k: camera matrix (px), ``(3, 3)`` float64.
         d: distortion coefficients in OpenCV's order, ``(n,)`` float64; none given (plumb_bob only): no distortion.
+
+    Raises:
+        CalibrationError: a field is wrong, or there are no directions behind pixels in the middle of the image.
     """
 
     def __init__(self, width: int, height: int, distortion_model: str, d: ArrayLike, k: ArrayLike) -> None:
@@ -60,6 +64,11 @@ class CameraModel:
             raise CalibrationError('camera_matrix: must read [fx s cx; 0 fy cy; 0 0 1]')
         self.distortion_model = distortion_model
         self.d = _coefficients(distortion_model, d)
+        middle, centre = (self.width / 2, self.height / 2), self.k[:2, 2]
+        with np.errstate(all='ignore'):
+            directions = self.bearings(np.vstack((middle, centre + _NEAR * self.width)))
+        if not np.all(np.isfinite(directions)):
+            raise CalibrationError("camera_matrix, distortion_coefficients: pixels in the image's middle have no direction")
 
     @classmethod
     def from_yaml(cls, path: Path | str) -> CameraModel:
