@@ -11,6 +11,7 @@ pytest.importorskip('rclpy')
 
 from hypothesis import given  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
+from sensor_msgs.msg import CameraInfo  # noqa: E402
 
 from beacon_comm.core.candidates import BeaconState  # noqa: E402
 from beacon_comm.core.character import Character, Status  # noqa: E402
@@ -19,7 +20,7 @@ from beacon_comm.core.events import NS_PER_S  # noqa: E402
 from beacon_comm.core.receiver import BeaconSnapshot  # noqa: E402
 from beacon_comm.ros import conversions  # noqa: E402
 from beacon_comm.ros.beacon_node import guarded  # noqa: E402
-from beacon_comm.ros.camera import load_camera, resolve_url  # noqa: E402
+from beacon_comm.ros.camera import camera_of_message, load_camera, resolve_url  # noqa: E402
 from beacon_comm.ros.report import Report  # noqa: E402
 from beacon_comm.ros.silence import Cause, Situation, why_silent  # noqa: E402
 from beacon_comm.ros.stamped import Instant, StampedCharacter  # noqa: E402
@@ -272,3 +273,17 @@ def test_a_calibration_that_is_not_there_is_refused_by_name(url: str) -> None:
 
 def test_no_calibration_is_none() -> None:
     assert load_camera('') is None
+
+
+def test_the_same_camera_info_is_the_same_camera() -> None:
+    k = [500.0, 0.0, 320.0, 0.0, 500.0, 240.0, 0.0, 0.0, 1.0]
+    message = CameraInfo(width=640, height=480, distortion_model='plumb_bob', d=[0.0] * 5, k=k)
+    camera = camera_of_message(message)
+    assert camera_of_message(message) is camera is not None
+    other = camera_of_message(CameraInfo(width=640, height=480, distortion_model='plumb_bob', d=[0.1] * 5, k=k))
+    assert other is not None and other.d.tolist() == [0.1] * 5
+    for refused in ({'d': [1e300] * 5}, {'k': [1e-320, *k[1:]]}, {'distortion_model': 'x' * 4_000_000}):
+        fields = {'width': 640, 'height': 480, 'distortion_model': 'plumb_bob', 'd': [0.0] * 5, 'k': k} | refused
+        with pytest.raises(CalibrationError) as caught:
+            camera_of_message(CameraInfo(**fields))
+        assert len(str(caught.value)) < 200

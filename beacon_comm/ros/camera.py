@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 from urllib.parse import unquote, urlparse
 
@@ -53,6 +54,9 @@ def camera_of_message(message: CameraInfo) -> CameraModel | None:
     """
     if message.k[0] == 0.0:
         return None
-    return CameraModel.from_camera_info(
-        message.width, message.height, message.distortion_model, list(message.d), list(message.k)
-    )
+    return _camera(message.width, message.height, message.distortion_model, tuple(message.d), tuple(message.k))
+
+
+@lru_cache(maxsize=1)  # drivers send the same with every packet
+def _camera(width: int, height: int, distortion_model: str, d: tuple[float, ...], k: tuple[float, ...]) -> CameraModel:
+    return CameraModel.from_camera_info(width, height, distortion_model, d, k)
