@@ -158,6 +158,59 @@ def test_damage_within_a_file_keeps_what_is_before(tmp_path: Path, plugin: rosba
     assert kept[:6] == MESSAGES[:6]
 
 
+CHUNKED = [(1_000 * k, b'\x00\x01\x00\x00' + bytes([k]) * 300_000) for k in range(12)]  # 4 messages a chunk
+
+
+def chunked_mcap(folder: Path) -> tuple[Path, bytearray, list[tuple[int, int]]]:
+    """Return the file of an MCAP of several chunks, its bytes, and where its records are: opcode and begin."""
+    with BagWriter(folder) as writer:
+        writer.add_topic(TOPIC, PACKET_TYPE)
+        for t_ns, cdr in CHUNKED:
+            writer.write(TOPIC, t_ns, cdr)
+    file = folder / f'{folder.name}.mcap'
+    content = bytearray(file.read_bytes())
+    records, at = [], 8
+    while at < len(content) - 8:
+        opcode, length = struct.unpack_from('<BQ', content, at)
+        records.append((opcode, at))
+        at += 9 + length
+    return file, content, records
+
+
+@pytest.mark.parametrize('opcode', [6, 7])
+@pytest.mark.parametrize('place', range(3))
+@pytest.mark.parametrize('bit', [3, 8, 19, 21, 40, 63])
+def test_a_wrong_length_in_an_mcap_costs_nothing_that_its_index_names(
+    opcode: int, place: int, bit: int, tmp_path: Path
+) -> None:
+    file, content, records = chunked_mcap(tmp_path / 'bag')
+    at = [begin for code, begin in records if code == opcode][place]
+    content[at + 1 + bit // 8] ^= 1 << bit % 8
+    file.write_bytes(content)
+    kept, complaint = partly(file)
+    assert len(kept) == 12 and kept == CHUNKED
+    assert str(file) in complaint and complaint.count(':') == 1
+
+
+def test_without_an_index_a_wrong_length_in_an_mcap_keeps_what_is_before(tmp_path: Path) -> None:
+    file, content, records = chunked_mcap(tmp_path / 'bag')
+    second = [begin for opcode, begin in records if opcode == 6][1]
+    content[second + 6] ^= 1
+    for damaged in (content[: records[-1][1]], content[:-1], content[:-28] + bytes(8) + content[-20:]):
+        file.write_bytes(damaged)
+        kept, complaint = partly(file)
+        assert len(kept) == 4 and kept == CHUNKED[:4] and 'in the middle of a record' in complaint
+
+
+def test_a_chunk_that_declares_the_topic_may_be_lost(tmp_path: Path) -> None:
+    file, content, records = chunked_mcap(tmp_path / 'bag')
+    first = next(begin for opcode, begin in records if opcode == 6)
+    content[first + 9 + 16] ^= 1  # its size
+    file.write_bytes(content)
+    kept, complaint = partly(file)
+    assert len(kept) == 8 and kept == CHUNKED[4:] and 'a chunk fails its checksum' in complaint
+
+
 def partly(path: Path) -> tuple[list[tuple[int, bytes]], str]:
     """Return what a damaged bag gives, and how it complains at the end."""
     kept: list[tuple[int, bytes]] = []
