@@ -19,7 +19,7 @@ from beacon_comm.core.errors import CalibrationError  # noqa: E402
 from beacon_comm.core.events import NS_PER_S  # noqa: E402
 from beacon_comm.core.receiver import BeaconSnapshot  # noqa: E402
 from beacon_comm.ros import conversions  # noqa: E402
-from beacon_comm.ros.beacon_node import guarded  # noqa: E402
+from beacon_comm.ros.beacon_node import BeaconNode, guarded  # noqa: E402
 from beacon_comm.ros.camera import camera_of_message, load_camera, resolve_url  # noqa: E402
 from beacon_comm.ros.report import Report  # noqa: E402
 from beacon_comm.ros.silence import Cause, Situation, why_silent  # noqa: E402
@@ -207,6 +207,7 @@ def test_whatever_goes_wrong_in_a_callback_the_node_goes_on() -> None:
     lines: list[str] = []
 
     class Node:
+        survive = BeaconNode.survive
         report = Report()
         log_error = staticmethod(ThrottledLog(lines.append, NS_PER_S))
 

@@ -92,6 +92,8 @@ class Day:
         return self.peer.heard['/diagnostics'][-1].status[0]
 
     def count(self, kind: str) -> int:
+        if not self.peer.heard['/diagnostics']:
+            return 0
         return next((int(entry.value) for entry in self.status().values if entry.key == kind), 0)
 
 
