@@ -110,12 +110,18 @@ def burst(first_seq: int, start_ns: int) -> list[bytes]:
     return made
 
 
-def test_a_day_of_faults(peer: Peer, node: NodeProcess) -> None:
+def begun(peer: Peer, node: NodeProcess) -> Day:
+    """Return a day on which both hear one another."""
     day = Day(peer)
     node.wait_for(f'waiting for events on {TOPIC}')
     peer.advertise(EventPacket, TOPIC, ReliabilityPolicy.BEST_EFFORT)
     assert peer.spin_until(peer.publisher.get_subscription_count), node.output()
     assert peer.spin_until(lambda: peer.node.count_publishers('/beacon_node/characters'))
+    return day
+
+
+def test_a_day_of_faults(peer: Peer, node: NodeProcess) -> None:
+    day = begun(peer, node)
     stream = packets(beacon_events(12 * TEXT))
     part = len(stream) // 4
 
@@ -161,11 +167,7 @@ def test_a_day_of_faults(peer: Peer, node: NodeProcess) -> None:
 
 
 def test_a_clock_of_negative_time_ends_no_node(peer: Peer, node: NodeProcess) -> None:
-    day = Day(peer)
-    node.wait_for(f'waiting for events on {TOPIC}')
-    peer.advertise(EventPacket, TOPIC, ReliabilityPolicy.BEST_EFFORT)
-    assert peer.spin_until(peer.publisher.get_subscription_count), node.output()
-    assert peer.spin_until(lambda: peer.node.count_publishers('/beacon_node/characters'))
+    day = begun(peer, node)
     stream = packets(beacon_events(2 * TEXT))
     day.publish(stream[:20])
     day.tick(-day.now_ns - 5 * NS_PER_S)
