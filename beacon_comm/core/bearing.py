@@ -34,9 +34,10 @@ _STEP_PX = 0.01  # of the Jacobian's central difference: far above rounding, far
 _NEWTON_STEPS = 8
 _SOLVED_PX = 1e-3  # a solution projects back this close
 _EXACT_PX = 1e-9
-_NEAR = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)]) * 0.05  # of the width, around the principal point
+_AROUND = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])
+_NEAR = 0.05 * _AROUND  # of the width, around the principal point
 _PLANE_STEP = 1e-6
-_PLANE_STEPS = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)]) * _PLANE_STEP
+_PLANE_STEPS = _AROUND * _PLANE_STEP
 
 
 class CameraModel:

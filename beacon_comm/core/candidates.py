@@ -120,7 +120,6 @@ class Gaps:
 class _Slot:
     demodulator: Demodulator
     record: ParityRecord
-    stop_bits: int
     gaps: Gaps
     carried_on: Gaps
     read_to_ns: int | None
@@ -131,10 +130,10 @@ class _Slot:
         for character in characters:
             end_ns = self.record.end_of(character)
             self.read_to_ns = end_ns if self.read_to_ns is None else max(self.read_to_ns, end_ns)
-            bit_ns = NS_PER_S / character.bit_rate_bps
-            if self.gaps.overlap(character.t_ns - round(UNSETTLED_BITS * bit_ns), end_ns):
+            unsettled_ns = round(UNSETTLED_BITS * NS_PER_S / character.bit_rate_bps)
+            if self.gaps.overlap(character.t_ns - unsettled_ns, end_ns):
                 continue
-            if self.carried_on.overlap(character.t_ns, end_ns - round(self.stop_bits * bit_ns)):
+            if self.carried_on.overlap(character.t_ns, self.record.checked_end_of(character)):
                 status = Status.REPAIRED if character.status is Status.OK else character.status
                 character = replace(character, status=status, confidence=min(character.confidence, UNHEARD_CONFIDENCE))
             self.record.push(character)
@@ -389,8 +388,7 @@ class CandidateSlots:
         tried = self._tried.pop(track_id, None)
         read_to_ns = None if tried is None else tried.read_to_ns
         first = 0 if read_to_ns is None else int(np.searchsorted(times, read_to_ns, 'left'))
-        demodulator, record = self._make_demodulator(self._p), ParityRecord(self._p)
-        slot = _Slot(demodulator, record, self._p.stop_bits, self._gaps, self._carried_on, read_to_ns)
+        slot = _Slot(self._make_demodulator(self._p), ParityRecord(self._p), self._gaps, self._carried_on, read_to_ns)
         self._slots[track_id] = slot
         slot.record.advance(t_ns, quiet=False)
         if isinstance(slot.demodulator, Searching):

@@ -152,6 +152,10 @@ class ParityRecord:
         """Return the nominal end of a character (ns, sensor clock)."""
         return character.t_ns + round(self._layout.duration_ns(character.bit_rate_bps))
 
+    def checked_end_of(self, character: Character) -> int:
+        """Return the nominal end of a character's data and parity, where its stop bits begin (ns, sensor clock)."""
+        return self.end_of(character) - round(self._layout.stop_bits * NS_PER_S / character.bit_rate_bps)
+
     def _count(self, character: Character) -> None:
         status = character.status
         self.characters += 1

@@ -239,13 +239,12 @@ class Receiver:
         """Tell the slots what is missing before a batch, or that nobody vouches for it."""
         if self._t_ns is None:
             return
+        heard_ns = self._t_ns if self._heard_ns is None else self._heard_ns
         if batch.carried_on:
             self._slots.carry_on(self._t_ns, batch.t_end_ns)
-            self._heard_ns = self._t_ns if self._heard_ns is None else self._heard_ns
-            return
-        if batch.missing_until_ns is not None:
-            self._slots.miss(self._t_ns if self._heard_ns is None else self._heard_ns, batch.missing_until_ns)
-        self._heard_ns = None
+        elif batch.missing_until_ns is not None:
+            self._slots.miss(heard_ns, batch.missing_until_ns)
+        self._heard_ns = heard_ns if batch.carried_on else None
 
     def _segments(self, batch: EventBatch) -> Iterator[tuple[EventBatch, bool]]:
         """Cut a batch at the points of the hop grid; yield each piece and whether it ends at one."""

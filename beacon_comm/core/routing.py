@@ -101,11 +101,7 @@ class RoutedEvents(Mapping[int, Routed]):
         return routed
 
     def __iter__(self) -> Iterator[int]:
-        start = 0
-        for track_id, stop in zip(self._place, self._stops.tolist(), strict=True):
-            if stop > start:
-                yield track_id
-            start = stop
+        return (track_id for track_id, _ in self.by_track())
 
     def __len__(self) -> int:
         return int(np.count_nonzero(np.diff(self._stops, prepend=0)))

@@ -18,7 +18,7 @@ from beacon_comm.recordings.mat5 import is_mat5, variables
 
 # Beyond this a double no longer holds whole microseconds with room to round: some 34 years.
 MAX_TIME_S = 2.0**30
-LONGEST_S = 86_400.0
+DAY_S = 86_400.0
 
 
 def read_mat(path: str | Path) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
@@ -57,7 +57,7 @@ def read_mat(path: str | Path) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
     if len(steps_back):
         k = int(steps_back[0]) + 1
         raise RecordingError(f'{path}: event_t steps back at event {k} ({t_s[k - 1]:.6f} s to {t_s[k]:.6f} s)')
-    if t_s[-1] - t_s[0] > LONGEST_S:
+    if t_s[-1] - t_s[0] > DAY_S:
         raise RecordingError(
             f'{path}: event_t spans {t_s[-1] - t_s[0]:g} s, more than a day (times have to be in seconds)'
         )

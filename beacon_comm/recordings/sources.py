@@ -17,7 +17,7 @@ from beacon_comm.core.errors import ParameterError, RecordingError
 from beacon_comm.core.events import NS_PER_S, EventBatch
 from beacon_comm.recordings.bags import open_recording
 from beacon_comm.recordings.disc import Disc
-from beacon_comm.recordings.mat import LONGEST_S, read_mat
+from beacon_comm.recordings.mat import DAY_S, read_mat
 from beacon_comm.wire.stream import EventStream
 
 _REPEAT_GRID_NS = 1_000_000
@@ -38,9 +38,9 @@ class Clip:
     count: int = 1
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.start_s <= LONGEST_S:
+        if not 0.0 <= self.start_s <= DAY_S:
             raise ParameterError(f'clip start {self.start_s:g}: must be 0 s or more, at most a day')
-        if self.duration_s is not None and not 0.0 < self.duration_s <= LONGEST_S:
+        if self.duration_s is not None and not 0.0 < self.duration_s <= DAY_S:
             raise ParameterError(f'clip duration {self.duration_s:g}: must be above 0 s, at most a day')
         if self.count < 1:
             raise ParameterError(f'clip count {self.count}: must be at least 1')
@@ -86,8 +86,8 @@ class Clip:
             period = max(-(-(last + 1) // _REPEAT_GRID_NS) * _REPEAT_GRID_NS, 0)
         first, stop = np.searchsorted(since_start, [0, period])
         once, its_polarity = since_start[first:stop], polarity[first:stop]
-        longest_ns = LONGEST_S * NS_PER_S
-        if self.count > 1 and (self.count * period > longest_ns or self.count * max(1, len(once)) > _MOST_EVENTS):
+        day_ns = DAY_S * NS_PER_S
+        if self.count > 1 and (self.count * period > day_ns or self.count * max(1, len(once)) > _MOST_EVENTS):
             raise ParameterError(f'clip count {self.count}: more than a day, or than {_MOST_EVENTS} events')
         times = np.concatenate([once + k * period for k in range(self.count)])
         return times, np.tile(its_polarity, self.count), period * self.count

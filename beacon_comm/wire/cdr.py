@@ -92,8 +92,8 @@ def parse_event_packet(cdr: Bytes) -> Packet:
     """Read an EventPacket (or its predecessor, ``event_array_msgs/msg/EventArray``: the same bytes).
 
     Raises:
-        WireError: the bytes are too short for what they announce, not little-endian CDR, or the time base is
-            beyond 2⁶² ns.
+        WireError: the bytes are too short for what they announce, not little-endian CDR, a text is too long, or the time
+            base is beyond 2⁶² ns.
     """
     view = _contents(cdr)
     stamp_ns, frame_id, height, width, at = _header_and_size(view)

@@ -86,6 +86,7 @@ _NO_BASE = 1 << 40
 # How a packet follows the one before; whether it had a TIME_HIGH yet; whether that told of a restart; by how much its other
 # ones have leapt, and how many were skipped for that.
 _ELAPSED_US, _SEQ_FELL, _FOLLOWED, _RESTARTED, _LEAPT_US, _UNBELIEVED = range(6)
+_LINK_SIZE = 6
 
 
 class Evt3Decoder:
@@ -93,7 +94,7 @@ class Evt3Decoder:
 
     def __init__(self) -> None:
         self._state = np.zeros(_STATE_SIZE, np.int64)
-        self._link = np.zeros(6, np.int64)
+        self._link = np.zeros(_LINK_SIZE, np.int64)
         self._state[_HIGH_US] = self._state[_LATEST_US] = _UNKNOWN
         self._forget()
 
