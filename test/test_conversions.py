@@ -9,9 +9,13 @@ import pytest
 
 pytest.importorskip('rclpy')
 
+from beacon_comm.msg import Character as CharacterMessage  # noqa: E402
+from beacon_comm.msg import Characters  # noqa: E402
 from hypothesis import given  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
+from rclpy.serialization import deserialize_message  # noqa: E402
 from sensor_msgs.msg import CameraInfo  # noqa: E402
+from std_msgs.msg import Header  # noqa: E402
 
 from beacon_comm.core.candidates import BeaconState  # noqa: E402
 from beacon_comm.core.character import Character, Status  # noqa: E402
@@ -62,7 +66,8 @@ def test_a_time_beyond_the_message_is_cut() -> None:
 
 
 def test_a_character_keeps_every_field() -> None:
-    message = conversions.characters_message(AT, 'camera', [character(), character(10, 8, Status.PARITY_ERROR)])
+    characters = [character(), character(10, 8, Status.PARITY_ERROR)]
+    message = deserialize_message(conversions.characters_cdr(AT, 'camera', characters), Characters)
     assert message.header.frame_id == 'camera'
     assert message.sensor_time_ns == 2**40
     first, second = message.characters
@@ -73,11 +78,39 @@ def test_a_character_keeps_every_field() -> None:
     assert (first.stamp.sec, first.stamp.nanosec) == (1_700_000_000, 123_456_789)
 
 
+@given(
+    frame_id=st.text(st.characters(exclude_characters='\0', codec='utf-8'), max_size=20),
+    t_ns=st.integers(-(2**31) * 10**9, (2**31 - 1) * 10**9),
+    codes=st.lists(st.integers(0, 255), max_size=4),
+    ratios=st.lists(st.floats(width=32, allow_nan=False), max_size=13),
+    rate_bps=st.floats(allow_nan=False),
+)
+def test_the_bytes_of_characters_are_read_as_the_message_that_they_stand_for(
+    frame_id: str, t_ns: int, codes: list[int], ratios: list[float], rate_bps: float
+) -> None:
+    at = Instant(t_ns, -t_ns)
+    characters = [
+        StampedCharacter(k, Character(t_ns, code, Status.REPAIRED, 0.5, 0, rate_bps, tuple(ratios[: code % 14])), at)
+        for k, code in enumerate(codes)
+    ]
+    stamp = conversions.time_message(t_ns)
+    expected = Characters(header=Header(stamp=stamp, frame_id=frame_id), sensor_time_ns=-t_ns)
+    with np.errstate(over='ignore'):
+        expected.characters = [
+            CharacterMessage(
+                track_id=k, code=code, status=CharacterMessage.REPAIRED, confidence=0.5, stamp=stamp, sensor_time_ns=-t_ns,
+                bit_rate_bps=float(np.float32(rate_bps)), bit_llr=ratios[: code % 14],
+            )
+            for k, code in enumerate(codes)
+        ]  # fmt: skip
+    assert deserialize_message(conversions.characters_cdr(at, frame_id, characters), Characters) == expected
+
+
 def test_the_states_and_statuses_are_those_of_the_messages() -> None:
     for state in BeaconState:
         assert getattr(conversions.Beacon, state.name) == state
     for status in Status:
-        assert getattr(conversions.Character, status.name) == status
+        assert getattr(CharacterMessage, status.name) == status
 
 
 def test_a_calibrated_beacon_has_a_bearing() -> None:

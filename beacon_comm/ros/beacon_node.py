@@ -225,9 +225,7 @@ class BeaconNode(Node):
         """Publish what is due at once, keep the rest for the next turn of :meth:`_on_publish`."""
         self.report.characters(len(step.characters))
         if step.characters:
-            self._characters.publish(
-                conversions.characters_message(step.at, self._live.frame_id, step.characters)
-            )
+            self._characters.publish(conversions.characters_cdr(step.at, self._live.frame_id, step.characters))
             for character in step.characters:
                 self._texts.add(character)
         self._lost += step.lost
@@ -357,4 +355,5 @@ class BeaconNode(Node):
         self._on_publish()
 
     def _now_ns(self) -> int:
-        return self.get_clock().now().nanoseconds
+        clock = self.get_clock()
+        return clock.now().nanoseconds if clock.ros_time_is_active else time.time_ns()
