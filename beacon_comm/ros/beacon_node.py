@@ -50,13 +50,14 @@ from beacon_comm.ros.topic import (
     similar_topics,
     subscribe_raw,
 )
+from beacon_comm.wire.stream import is_event_array_type
 
 NODE_NAME = 'beacon_node'
 GRAPH_PERIOD_S = 0.25
 REPORT_PERIOD_S = 1.0
-LONGEST_TURN_S, LONGEST_SIMULATED_TURN_S = 0.02, 0.005
-"""Messages are read, and waited for, until it is time to publish, but for no longer before other timers, /clock and the graph's
-news have their turn; where /clock tells the time, that is to come soon."""
+LONGEST_WAIT_S, LONGEST_TURN_S, LONGEST_SIMULATED_TURN_S = 0.02, 0.1, 0.005
+"""Messages are read, and each waited for so long, before calibrations, the graph's news and requests have their turn; it comes
+sooner for /clock where that tells the time, and for the middleware's word of lost messages where no seq does."""
 LOG_PERIOD_NS = NS_PER_S
 SILENCE_LOG_PERIOD_NS = 10 * NS_PER_S
 ACKNOWLEDGED_WITHIN = Duration(nanoseconds=NS_PER_S // 5)
@@ -155,8 +156,10 @@ class BeaconNode(Node):
         # Timers run on the steady clock: under use_sim_time the node's own may stand.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._tick_s = own.silent_clock_after_s / 2.0
-        self.create_timer(self._tick_s, self._on_tick, clock=steady)
-        self._publish_timer = self.create_timer(1.0 / own.publish_rate_hz, self._on_publish, clock=steady)
+        self._prompt_timers = [
+            (self.create_timer(period_s, callback, clock=steady), callback)
+            for period_s, callback in ((self._tick_s, self._on_tick), (1.0 / own.publish_rate_hz, self._on_publish))
+        ]
         self.create_timer(GRAPH_PERIOD_S, self._on_graph, clock=steady)
         self.create_timer(REPORT_PERIOD_S, self._on_report, clock=steady)
         backwards = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True)
@@ -168,13 +171,30 @@ class BeaconNode(Node):
 
     @guarded
     def _on_message(self, cdr: bytes, info: dict[str, int]) -> None:
-        # A turn of the executor takes as long as reading a packet: messages that wait, or come soon, are read in the same one.
-        longest_s = LONGEST_SIMULATED_TURN_S if self.get_clock().ros_time_is_active else LONGEST_TURN_S
-        stop_s = time.monotonic() + min(longest_s, (self._publish_timer.time_until_next_call() or 0) / NS_PER_S)
+        # A turn of the executor takes longer than reading a packet: messages that wait, or come soon, are read in the same one.
+        end_s = time.monotonic() + self._longest_turn_s()
         self._read(cdr, info)
-        while (left_s := stop_s - time.monotonic()) > 0.0 and self._queue is not None:
-            if (waiting := self._queue.take(left_s)) is not None:
+        stop_s, due_s = min(end_s, time.monotonic() + LONGEST_WAIT_S), 0.0
+        while self._queue is not None and (now_s := time.monotonic()) < stop_s:
+            if now_s >= due_s:
+                due_s = now_s + self._call_prompt_timers()
+            if (waiting := self._queue.take(min(stop_s, due_s) - now_s)) is not None:
                 self._read(*waiting)
+                stop_s = min(end_s, time.monotonic() + LONGEST_WAIT_S)
+
+    def _longest_turn_s(self) -> float:
+        if self.get_clock().ros_time_is_active:
+            return LONGEST_SIMULATED_TURN_S
+        return LONGEST_WAIT_S if self._type is not None and is_event_array_type(self._type) else LONGEST_TURN_S
+
+    def _call_prompt_timers(self) -> float:
+        """Call back, as the executor would, the timers that messages are not to hold up; return how long the next has (s)."""
+        for timer, callback in self._prompt_timers:
+            if timer.is_ready():
+                with timer.handle:
+                    timer.handle.call_timer()
+                callback()
+        return min(max(timer.time_until_next_call() or 0, 0) for timer, _ in self._prompt_timers) / NS_PER_S
 
     @guarded
     def _read(self, cdr: bytes, info: dict[str, int]) -> None:
