@@ -40,7 +40,7 @@ def test_sliding_windows_equal_counting_from_scratch(threshold, offset, size):
     images = IndexImages(parameters, size)
     assert [window.hops for window in images.windows] == [2, 11]
     events = noise(*size, rate_per_s=min(200_000, 5_000 * size[0] * size[1]), duration_s=0.3)  # no count is full
-    for segment in hops(events):
+    for k, segment in enumerate(hops(events)):
         images.push(gathered(segment, size))
         for window in images.windows:
             start = segment.t_end_ns - window.hops * HOP_NS
@@ -50,6 +50,8 @@ def test_sliding_windows_equal_counting_from_scratch(threshold, offset, size):
             assert window.events == images.counts(window).sum()
             low = images.index(window) >= parameters.index_threshold / 2
             np.testing.assert_array_equal(images.low_pixels(window), low)
+        taken_off = [images.take_off() for _ in range(k % 4)]  # nothing, a window, both
+        assert taken_off == [True, True, False][: k % 4]
 
 
 def test_windows_run_empty():
@@ -150,6 +152,8 @@ def test_the_ring_is_bounded_and_overflow_counted(sizes, max_bytes):
         )
         for window in images.windows:
             assert images.counts(window).sum() == window.events
+        for _ in range(k % 3):
+            images.take_off()
     if pushed * 8 + len(sizes) * images.grid.height * (16 + 8 * 2 * HOP_PLANES * images.grid.words) <= max_bytes:
         assert images.overflow_events == 0
     assert images.windows[-1].events + images.overflow_events <= pushed

@@ -1,7 +1,7 @@
 """The whole receiver on simulated scenes: any batching, any clock, silence, restarts, a fair queue."""
 
 from dataclasses import replace
-from itertools import pairwise
+from itertools import cycle, pairwise
 
 import numpy as np
 import pytest
@@ -102,12 +102,17 @@ def test_both_beacons_are_read_and_confirmed_and_the_lamp_is_not(at_once: tuple[
 
 @settings(max_examples=8, deadline=None)
 @given(data=st.data())
-def test_any_batching_gives_the_same_output(
+def test_any_batching_and_any_rest_give_the_same_output(
     data: st.DataObject, scene: EventBatch, at_once: tuple[Receiver, list[Output]]
 ) -> None:
     cuts = data.draw(st.lists(st.integers(0, len(scene)), max_size=60))
+    rests = data.draw(st.lists(st.integers(0, 4), min_size=1, max_size=5))
     receiver = Receiver(Parameters(), SIZE)
-    outputs = [receiver.push(piece) for piece in pieces(scene, cuts)]
+    outputs = []
+    for piece, most in zip(pieces(scene, cuts), cycle(rests), strict=False):
+        outputs.append(receiver.push(piece))
+        for _ in range(most):
+            receiver.rest()
     outputs.append(receiver.flush())
     assert received(outputs) == received(at_once[1])
     assert receiver.beacons() == at_once[0].beacons()

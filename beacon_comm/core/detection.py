@@ -31,6 +31,24 @@ from beacon_comm.core.routing import NOTHING_ROUTED, RoutedEvents, Router
 from beacon_comm.core.tracks import Track, TrackChanges, Tracker
 
 
+@dataclass(frozen=True, slots=True)
+class _Untidied:
+    """What a hop leaves to be done with the tracks' buffers: nobody waits for it.
+
+    Attributes:
+        routed: what was routed in the hop interval.
+        exchanged: the tracks that went on where the other one is.
+        blobs, changes: of the hop.
+        t_hop_ns: the hop's time (ns).
+    """
+
+    routed: list[RoutedEvents]
+    exchanged: list[tuple[int, int]]
+    blobs: list[Blob]
+    changes: TrackChanges
+    t_hop_ns: int
+
+
 @dataclass(slots=True)
 class DetectionStats:
     """What detection has counted since it was made.
@@ -74,6 +92,7 @@ class Detector:
         self._tracker = MotionTracker(parameters, sensor_size) if self._follows else Tracker(parameters, sensor_size)
         self._buffers: dict[int, EventBuffer] = {}
         self._routed: list[RoutedEvents] = []  # since the last hop
+        self._untidied: _Untidied | None = None
         self._stats = DetectionStats()
         self._outside_before = self._overflow_before = 0
         self._start(sensor_size)
@@ -102,6 +121,7 @@ class Detector:
     @property
     def stats(self) -> DetectionStats:
         """What has been counted so far."""
+        self._tidy()
         self._stats.outside_events = self._outside_before + self._router.outside_events
         self._stats.window_overflow_events = self._overflow_before + self._images.overflow_events
         return self._stats
@@ -160,8 +180,20 @@ class Detector:
         Raises:
             KeyError: no such track.
         """
-        self._fill_buffers()
+        self._tidy()
+        self._fill_buffers(self._routed)
+        self._routed = []
         return self._buffers[track_id].events()
+
+    def rest(self) -> bool:
+        """Do a piece of what no event waits for, while none is there; return whether there was anything to do.
+
+        When it is done, or whether, makes no difference to what is found: the next hop does what is left.
+        """
+        if self._untidied is None:
+            return self._images.take_off()
+        self._tidy()
+        return True
 
     def resize(self, sensor_size: tuple[int, int]) -> TrackChanges:
         """Go on with another sensor size ``(width, height)`` (px): all tracks are lost, labels go on."""
@@ -170,7 +202,7 @@ class Detector:
         changes = TrackChanges(lost=self._early.lost + self._tracker.clear(sensor_size).lost)
         self._stats.lost_tracks += len(changes.lost) - len(self._early.lost)
         self._buffers.clear()
-        self._routed.clear()
+        self._routed, self._untidied = [], None
         self._start(sensor_size)
         return changes
 
@@ -180,13 +212,14 @@ class Detector:
 
     def _step(self, t_hop_ns: int) -> TrackChanges:
         """Take one hop; the paper's detection, one call a stage."""
-        self._fill_buffers()
+        self._tidy()
         self._images.push(self._router.close())
-        self._exchange()
+        exchanged = self._exchange()
         blobs = self._blobs.find(self._images, t_hop_ns, self._router.near)
         changes = self._tracker.update(blobs, t_hop_ns)
-        self._keep_buffers(blobs, changes, t_hop_ns)
         self._router.aim(tuple(self._tracker.tracks.values()), t_hop_ns)
+        self._untidied = _Untidied(self._routed, exchanged, blobs, changes, t_hop_ns)
+        self._routed = []
         self._stats.hops += 1
         self._stats.blobs = len(blobs)
         self._stats.waiting_blobs = changes.waiting
@@ -194,29 +227,37 @@ class Detector:
         self._stats.lost_tracks += len(changes.lost)
         return changes
 
-    def _fill_buffers(self) -> None:
-        """Hand the tracks' buffers what was routed since the last hop."""
-        if self._routed:
-            for track_id, part in RoutedEvents.joined(self._routed).by_track():
-                self._buffers[track_id].append(part.t_ns, part.polarity)
-            self._routed.clear()
+    def _exchange(self) -> list[tuple[int, int]]:
+        """Exchange the tracks that are to be; return them."""
+        tracks, asked_for = self._tracker.tracks, self._to_exchange
+        exchanged = [(one, other) for one, other in asked_for if one in tracks and other in tracks]
+        for one, other in exchanged:
+            self._tracker.exchange(one, other)
+        self._to_exchange = []
+        return exchanged
 
-    def _exchange(self) -> None:
-        for one, other in self._to_exchange:
-            if one in self._tracker.tracks and other in self._tracker.tracks:
-                self._tracker.exchange(one, other)
-                self._buffers[one], self._buffers[other] = self._buffers[other], self._buffers[one]
-        self._to_exchange.clear()
-
-    def _keep_buffers(self, blobs: list[Blob], changes: TrackChanges, t_hop_ns: int) -> None:
-        for old, new in changes.renamed:
+    def _tidy(self) -> None:
+        """Bring the tracks' buffers up to the last hop."""
+        if self._untidied is None:
+            return
+        hop, self._untidied = self._untidied, None
+        self._fill_buffers(hop.routed)
+        for one, other in hop.exchanged:
+            self._buffers[one], self._buffers[other] = self._buffers[other], self._buffers[one]
+        for old, new in hop.changes.renamed:
             self._buffers[new] = self._buffers[old]
-        for track in changes.lost:
+        for track in hop.changes.lost:
             del self._buffers[track.track_id]
-        if changes.new_blobs:
-            self._begin_buffers(blobs, changes)
+        if hop.changes.new_blobs:
+            self._begin_buffers(hop.blobs, hop.changes)
         for buffer in self._buffers.values():
-            self._stats.buffer_overflow_events += buffer.trim(t_hop_ns)
+            self._stats.buffer_overflow_events += buffer.trim(hop.t_hop_ns)
+
+    def _fill_buffers(self, parts: list[RoutedEvents]) -> None:
+        """Hand the tracks' buffers what was routed."""
+        if parts:
+            for track_id, part in RoutedEvents.joined(parts).by_track():
+                self._buffers[track_id].append(part.t_ns, part.polarity)
 
     def _begin_buffers(self, blobs: list[Blob], changes: TrackChanges) -> None:
         """Begin each new track's buffer with the events on its blob's pixels that are in the blob's window."""

@@ -68,6 +68,7 @@ class Window:
         used: how many planes of a row may have bits, ``(height,)`` int64.
         low: whether a pixel is above the lower threshold, row by row, ``(height, words)`` uint64, bit x % 64 of word x / 64.
         events: events in the window.
+        taken_off: whether the oldest hop has been taken off ``planes`` and ``low`` already: it leaves next.
     """
 
     hops: int
@@ -75,6 +76,7 @@ class Window:
     used: NDArray[np.int64]
     low: NDArray[np.uint64]
     events: int = 0
+    taken_off: bool = False
 
 
 class IndexImages:
@@ -124,11 +126,26 @@ class IndexImages:
     def push(self, events: HopEvents) -> None:
         """Move every window on by one hop that held ``events``."""
         for window in self.windows:
-            self._slide(window, self._ring[-window.hops], events)
+            leaving = self._ring[-window.hops]
+            self._slide(window, self._none if window.taken_off else leaving, events)
+            window.events += len(events) - len(leaving)
+            window.taken_off = False
         self._ring_bytes += events.size_bytes - self._ring[0].size_bytes
         self._ring.append(events)
         if self._ring_bytes > self._max_bytes:
             self._drop_oldest()
+
+    def take_off(self) -> bool:
+        """Take what leaves a window next off it now, so that there is less to do at the next hop; one window a call.
+
+        Its images are of one hop less until then.  Returns whether there was one left.
+        """
+        for window in self.windows:
+            if not window.taken_off:
+                self._slide(window, self._ring[-window.hops], self._none)
+                window.taken_off = True
+                return True
+        return False
 
     def _drop_oldest(self) -> None:
         for k in range(len(self._ring) - 1):  # the newest hop always stays
@@ -138,6 +155,7 @@ class IndexImages:
             for window in self.windows:
                 if k >= len(self._ring) - window.hops:
                     self._slide(window, events, self._none)
+                    window.events -= len(events)
             self._ring_bytes -= events.size_bytes
             self.overflow_events += len(events)
             self._ring[k] = self._none
@@ -148,7 +166,6 @@ class IndexImages:
                 leaving.rows, leaving.first, leaving.planes, coming.rows, coming.first, coming.planes, self._low, self._offset,
                 window.planes, window.used, window.low,
             )  # fmt: skip
-            window.events += len(coming) - len(leaving)
 
     def index(self, window: Window) -> NDArray[np.float64]:
         """Return the index image of ``window``, ``(height, width)`` float64 (paper, section III)."""

@@ -110,6 +110,7 @@ class Detection(Protocol):
     def backlog(self, track_id: int) -> tuple[NDArray[np.int64], NDArray[np.int8]]: ...
     def disown(self, track_id: int) -> None: ...
     def exchange(self, track_id: int, other_id: int) -> None: ...
+    def rest(self) -> bool: ...
     def resize(self, sensor_size: tuple[int, int]) -> TrackChanges: ...
     def reset(self) -> TrackChanges: ...
 
@@ -190,6 +191,13 @@ class Receiver:
         self._slots.forget_gaps()
         self._t_ns = self._heard_ns = None
         return output
+
+    def rest(self) -> bool:
+        """Do a piece of what no event waits for, while none is there; return whether there was anything to do.
+
+        It makes no difference to what is given out.
+        """
+        return self._detection.rest()
 
     def search_less(self, share: float) -> None:
         """Spend only this share of ``search_load`` on looking for bit rates from the next hop on; 1: all of it again."""

@@ -79,6 +79,10 @@ class WholeSignal:
         """Return the buffered events: times (ns), ``(n,)`` int64, and ±1, ``(n,)`` int8."""
         return self._buffer.events()
 
+    def rest(self) -> bool:
+        """Do nothing, and say so."""
+        return False
+
     def resize(self, sensor_size: tuple[int, int]) -> TrackChanges:
         """A signal has no pixels: as :meth:`reset`."""
         return self.reset()

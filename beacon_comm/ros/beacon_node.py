@@ -178,7 +178,7 @@ class BeaconNode(Node):
         while self._queue is not None and (now_s := time.monotonic()) < stop_s:
             if now_s >= due_s:
                 due_s = now_s + self._call_prompt_timers()
-            if (waiting := self._queue.take(min(stop_s, due_s) - now_s)) is not None:
+            if (waiting := self._queue.take(min(stop_s, due_s) - now_s, self._live.rest)) is not None:
                 self._read(*waiting)
                 stop_s = min(end_s, time.monotonic() + LONGEST_WAIT_S)
 

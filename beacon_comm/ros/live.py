@@ -156,6 +156,10 @@ class LiveReceiver:
             end_ns = batch.t_end_ns
         return self._step(now_ns, end_ns, decoded)
 
+    def rest(self) -> bool:
+        """Do a piece of what no message waits for, while none is there; return whether there was anything to do."""
+        return self._receiver is not None and self._receiver.rest()
+
     def shed(self, now_ns: int) -> None:
         """Pass a message over unread: there was no time for it.  What was in it is missing, not silent."""
         if self._stream is not None:

@@ -88,9 +88,14 @@ class MessageQueue:
         self._subscription = subscription
         self._wait_set = _rclpy.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
 
-    def take(self, wait_s: float) -> tuple[bytes, dict[str, int]] | None:
-        """Return the message that waits longest, and its information; None if none comes within ``wait_s`` (s)."""
+    def take(self, wait_s: float, rest: Callable[[], bool]) -> tuple[bytes, dict[str, int]] | None:
+        """Return the message that waits longest, and its information; None if none comes within ``wait_s`` (s).
+
+        ``rest`` is called while none is there, again and again until it returns False.
+        """
         taken = self._take_one()
+        while taken is None and rest():
+            taken = self._take_one()
         if taken is None and wait_s > 0.0:
             self._wait_set.clear_entities()
             self._wait_set.add_subscription(self._subscription.handle)
