@@ -269,7 +269,7 @@ class Receiver:
             yield batch.slice(start, stop, t_hop), True
             start = stop
         self._t_ns = batch.t_end_ns
-        yield batch.slice(start, len(batch), batch.t_end_ns), False
+        yield batch.slice(start, len(batch), batch.t_end_ns) if start else batch, False
 
     def _tell_apart(self, t_ns: int) -> None:
         """Give the beacons that have exchanged their tracks their labels back."""

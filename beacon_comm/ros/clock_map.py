@@ -48,11 +48,10 @@ class ClockMap:
 
     def observe(self, stamp_ns: int, sensor_ns: int) -> None:
         """Tie ROS time ``stamp_ns`` to sensor time ``sensor_ns``: a packet's stamp and its first event's time."""
-        if self.ready and (
-            self._renewing or sensor_ns < self._sensor_ns[-1] or stamp_ns < self.ros_ns(sensor_ns) - STEP_NS
-        ):
-            self._forget_anchors()
         floor_ns = self.ros_ns(sensor_ns) if self.ready else stamp_ns
+        if self.ready and (self._renewing or sensor_ns < self._sensor_ns[-1] or stamp_ns < floor_ns - STEP_NS):
+            self._forget_anchors()
+            floor_ns = stamp_ns
         self._sensor_ns.append(sensor_ns)
         self._stamp_ns.append(stamp_ns)
         self._floor_ns.append(floor_ns)
