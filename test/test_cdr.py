@@ -67,6 +67,11 @@ def test_lengths_beyond_the_message(at: int) -> None:
             parse_event_packet(cdr)
 
 
+def test_a_text_ends_at_its_first_zero() -> None:
+    assert parse_event_packet(build_event_packet(0, 'cam\0era', 640, 480, 0, 0, 'mono\0x', b'')).encoding == 'mono'
+    assert parse_event_packet(build_event_packet(0, 'cam\0era', 640, 480, 0, 0, 'mono', b'')).frame_id == 'cam'
+
+
 def test_what_is_not_plain_little_endian_cdr() -> None:
     with pytest.raises(WireError, match='encapsulation 0000'):
         parse_event_packet(b'\x00\x00' + PACKET[2:])

@@ -15,8 +15,8 @@ alignment counts from behind these four bytes.
     bool    is_bigendian
     uint8[] events: the payload
 
-A string is a uint32 length that counts the closing zero, then the bytes.  No length is trusted before it is held
-against the bytes that are there.  Payloads are views of the caller's bytes, not copies.
+A string is a uint32 length that counts the closing zero, then the bytes; it ends at the first zero.  No length is trusted
+before it is held against the bytes that are there.  Payloads are views of the caller's bytes, not copies.
 """
 
 from __future__ import annotations
@@ -210,7 +210,7 @@ def _string(view: memoryview, at: int, length: int, name: str) -> tuple[str, int
     _need(view, at + length, name)
     if length > MOST_TEXT_BYTES:
         raise WireError('text', f'{name} of {length} bytes: {MOST_TEXT_BYTES} at most')
-    return bytes(view[at : at + length]).rstrip(b'\x00').decode('utf-8', 'replace'), at + length
+    return bytes(view[at : at + length]).partition(b'\x00')[0].decode('utf-8', 'replace'), at + length
 
 
 def _need(view: memoryview, end: int, name: str) -> None:
