@@ -58,6 +58,19 @@ def test_any_batching_gives_the_same(cuts):
     assert len(whole[0]) >= 3 and any(lost for _, _, lost in whole[1][::3])
 
 
+@pytest.mark.parametrize('rests', [1, 9])
+def test_a_rest_changes_nothing_that_is_counted(rests):
+    """Not even before a restart, where a hop's work may be left."""
+    parameters = Parameters(buffer_max_bytes=9000)
+    idle, rested = Detector(parameters, SIZE), Detector(parameters, SIZE)
+    for size in (SIZE, SIZE, (200, 150)):
+        detect(idle, SCENE)
+        detect(rested, SCENE, lambda *_: [rested.rest() for _ in range(rests)])
+        idle.resize(size)
+        rested.resize(size)
+    assert idle.stats == rested.stats and idle.stats.buffer_overflow_events > 0
+
+
 def test_every_event_is_routed_at_most_once_and_only_to_a_track_that_is_near():
     events = busy_scene()
     routed = detect(Detector(Parameters(), SIZE), events)

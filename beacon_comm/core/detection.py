@@ -6,7 +6,8 @@
            index images ──► blobs ──► tracks
 
 Routing in a hop interval depends on nothing but the tracks at the last hop, and everything else happens at hops, so
-any batching of the same events gives the same tracks and the same routed events.
+any batching of the same events gives the same tracks and the same routed events.  What nobody waits for at a hop, the upkeep of
+the buffers above all, is done between it and the next one, as soon as it is asked for or there is time (:meth:`Detector.rest`).
 """
 
 from __future__ import annotations
@@ -197,12 +198,13 @@ class Detector:
 
     def resize(self, sensor_size: tuple[int, int]) -> TrackChanges:
         """Go on with another sensor size ``(width, height)`` (px): all tracks are lost, labels go on."""
+        self._tidy()
         self._outside_before += self._router.outside_events
         self._overflow_before += self._images.overflow_events
         changes = TrackChanges(lost=self._early.lost + self._tracker.clear(sensor_size).lost)
         self._stats.lost_tracks += len(changes.lost) - len(self._early.lost)
         self._buffers.clear()
-        self._routed, self._untidied = [], None
+        self._routed = []
         self._start(sensor_size)
         return changes
 
@@ -213,13 +215,13 @@ class Detector:
     def _step(self, t_hop_ns: int) -> TrackChanges:
         """Take one hop; the paper's detection, one call a stage."""
         self._tidy()
+        routed, self._routed = self._routed, []
         self._images.push(self._router.close())
         exchanged = self._exchange()
         blobs = self._blobs.find(self._images, t_hop_ns, self._router.near)
         changes = self._tracker.update(blobs, t_hop_ns)
         self._router.aim(tuple(self._tracker.tracks.values()), t_hop_ns)
-        self._untidied = _Untidied(self._routed, exchanged, blobs, changes, t_hop_ns)
-        self._routed = []
+        self._untidied = _Untidied(routed, exchanged, blobs, changes, t_hop_ns)
         self._stats.hops += 1
         self._stats.blobs = len(blobs)
         self._stats.waiting_blobs = changes.waiting

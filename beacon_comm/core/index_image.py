@@ -17,8 +17,8 @@ A window is kept as bit planes of its pixels' counts (:mod:`.hop_events` numbers
 
     n = on + off, Σσ = on - off
 
-A hop adds its counts and subtracts those of the hop that leaves, plane by plane until no carry is left, a row at a time and
-only rows that have any.  There it looks for the pixels with as many events as the lower threshold
+A hop adds its counts and subtracts those of the hop that leaves (or that was done before), plane by plane until no carry is
+left, a row at a time and only rows that have any.  There it looks for the pixels with as many events as the lower threshold
 (index_grow_share × index_threshold) takes at least, again plane by plane, and only for these at I.  Those above the threshold
 are one bit each, 64 to a word, as the next stage takes them.
 """
@@ -68,7 +68,7 @@ class Window:
         used: how many planes of a row may have bits, ``(height,)`` int64.
         low: whether a pixel is above the lower threshold, row by row, ``(height, words)`` uint64, bit x % 64 of word x / 64.
         events: events in the window.
-        taken_off: whether the oldest hop has been taken off ``planes`` and ``low`` already: it leaves next.
+        taken_off: whether the oldest hop, which leaves next, has been taken off ``planes`` and ``low`` (not ``events``).
     """
 
     hops: int

@@ -145,6 +145,10 @@ class ReferenceImages:
             place = (seen.on * height + seen.y) * width + seen.x
             window.counts = np.bincount(place, minlength=2 * height * width).reshape(2, height, width)
 
+    def take_off(self) -> bool:
+        """Do nothing ahead of time, and say so."""
+        return False
+
 
 @dataclass(frozen=True, slots=True)
 class ReferenceComponents:
