@@ -23,8 +23,9 @@ from beacon_comm.core.errors import CalibrationError  # noqa: E402
 from beacon_comm.core.events import NS_PER_S  # noqa: E402
 from beacon_comm.core.receiver import BeaconSnapshot  # noqa: E402
 from beacon_comm.ros import conversions  # noqa: E402
-from beacon_comm.ros.beacon_node import BeaconNode, guarded  # noqa: E402
+from beacon_comm.ros.beacon_node import FAILED_IN_A_ROW, BeaconNode, guarded  # noqa: E402
 from beacon_comm.ros.camera import camera_of_message, load_camera, resolve_url  # noqa: E402
+from beacon_comm.ros.overload import Shedder  # noqa: E402
 from beacon_comm.ros.report import Report  # noqa: E402
 from beacon_comm.ros.silence import Cause, Situation, why_silent  # noqa: E402
 from beacon_comm.ros.stamped import Instant, StampedCharacter  # noqa: E402
@@ -83,7 +84,7 @@ def test_a_character_keeps_every_field() -> None:
     t_ns=st.integers(-(2**31) * 10**9, (2**31 - 1) * 10**9),
     codes=st.lists(st.integers(0, 255), max_size=4),
     ratios=st.lists(st.floats(width=32, allow_nan=False), max_size=13),
-    rate_bps=st.floats(allow_nan=False),
+    rate_bps=st.floats(width=32, allow_nan=False),
 )
 def test_the_bytes_of_characters_are_read_as_the_message_that_they_stand_for(
     frame_id: str, t_ns: int, codes: list[int], ratios: list[float], rate_bps: float
@@ -95,14 +96,13 @@ def test_the_bytes_of_characters_are_read_as_the_message_that_they_stand_for(
     ]
     stamp = conversions.time_message(t_ns)
     expected = Characters(header=Header(stamp=stamp, frame_id=frame_id), sensor_time_ns=-t_ns)
-    with np.errstate(over='ignore'):
-        expected.characters = [
-            CharacterMessage(
-                track_id=k, code=code, status=CharacterMessage.REPAIRED, confidence=0.5, stamp=stamp, sensor_time_ns=-t_ns,
-                bit_rate_bps=float(np.float32(rate_bps)), bit_llr=ratios[: code % 14],
-            )
-            for k, code in enumerate(codes)
-        ]  # fmt: skip
+    expected.characters = [
+        CharacterMessage(
+            track_id=k, code=code, status=CharacterMessage.REPAIRED, confidence=0.5, stamp=stamp, sensor_time_ns=-t_ns,
+            bit_rate_bps=rate_bps, bit_llr=ratios[: code % 14],
+        )
+        for k, code in enumerate(codes)
+    ]  # fmt: skip
     assert deserialize_message(conversions.characters_cdr(at, frame_id, characters), Characters) == expected
 
 
@@ -254,6 +254,31 @@ def test_whatever_goes_wrong_in_a_callback_the_node_goes_on() -> None:
     assert node.report.totals['internal_errors'] == 2
     (line,) = lines
     assert 'in callback' in line and 'ZeroDivisionError' in line
+
+
+@pytest.mark.parametrize('failures', [FAILED_IN_A_ROW - 1, FAILED_IN_A_ROW, 3 * FAILED_IN_A_ROW])
+def test_a_state_that_every_message_fails_in_is_begun_anew(failures: int) -> None:
+    class Live:
+        def push(self, *_: object) -> None:
+            raise KeyError('a track')
+
+    class Node:
+        _read, survive = BeaconNode._read, BeaconNode.survive
+        _live, _shedder, _failed, opened = Live(), Shedder(NS_PER_S), 0, 0
+        report = Report()
+        log_error = staticmethod(ThrottledLog([].append, NS_PER_S))
+
+        def _now_ns(self) -> int:
+            return 0
+
+        def _open_stream(self) -> None:
+            self.opened += 1
+
+    node = Node()
+    for _ in range(failures):
+        node._read(b'', {'received_timestamp': 0})
+    assert node.report.totals['internal_errors'] == failures
+    assert node.opened == failures // FAILED_IN_A_ROW
 
 
 # --- the type of the topic ---

@@ -58,6 +58,8 @@ REPORT_PERIOD_S = 1.0
 LONGEST_WAIT_S, LONGEST_TURN_S, LONGEST_SIMULATED_TURN_S = 0.02, 0.1, 0.005
 """Messages are read, and each waited for so long, before calibrations, the graph's news and requests have their turn; it comes
 sooner for /clock where that tells the time, and for the middleware's word of lost messages where no seq does."""
+FAILED_IN_A_ROW = 10
+"""After so many messages that an internal error has kept from being read the stream is begun anew."""
 LOG_PERIOD_NS = NS_PER_S
 SILENCE_LOG_PERIOD_NS = 10 * NS_PER_S
 ACKNOWLEDGED_WITHIN = Duration(nanoseconds=NS_PER_S // 5)
@@ -118,6 +120,7 @@ class BeaconNode(Node):
         self._found = Publishers()
         self._silence: Silence | None = None
         self._only_refused = False
+        self._failed = 0  # messages in a row
         self._subscription: Subscription | None = None
         self._queue: MessageQueue | None = None
         self._make_publishers()
@@ -160,6 +163,7 @@ class BeaconNode(Node):
             (self.create_timer(period_s, callback, clock=steady), callback)
             for period_s, callback in ((self._tick_s, self._on_tick), (1.0 / own.publish_rate_hz, self._on_publish))
         ]
+        self._prompt_s = 0.0  # when to look at these again (s, monotonic clock)
         self.create_timer(GRAPH_PERIOD_S, self._on_graph, clock=steady)
         self.create_timer(REPORT_PERIOD_S, self._on_report, clock=steady)
         backwards = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True)
@@ -173,14 +177,19 @@ class BeaconNode(Node):
     def _on_message(self, cdr: bytes, info: dict[str, int]) -> None:
         # A turn of the executor takes longer than reading a packet: messages that wait, or come soon, are read in the same one.
         end_s = time.monotonic() + self._longest_turn_s()
-        self._read(cdr, info)
-        stop_s, due_s = min(end_s, time.monotonic() + LONGEST_WAIT_S), 0.0
-        while self._queue is not None and (now_s := time.monotonic()) < stop_s:
-            if now_s >= due_s:
-                due_s = now_s + self._call_prompt_timers()
-            if (waiting := self._queue.take(min(stop_s, due_s) - now_s, self._live.rest)) is not None:
-                self._read(*waiting)
-                stop_s = min(end_s, time.monotonic() + LONGEST_WAIT_S)
+        waiting: tuple[bytes, dict[str, int]] | None = (cdr, info)
+        while waiting is not None:
+            self._read(*waiting)
+            waiting = self._next_message(min(end_s, time.monotonic() + LONGEST_WAIT_S))
+
+    def _next_message(self, stop_s: float) -> tuple[bytes, dict[str, int]] | None:
+        """Return the next message, None if none comes until ``stop_s`` (s, monotonic clock); publish and tick meanwhile."""
+        waiting = None
+        while waiting is None and self._queue is not None and (now_s := time.monotonic()) < stop_s:
+            if now_s >= self._prompt_s:
+                self._prompt_s = now_s + self._call_prompt_timers()
+            waiting = self._queue.take(min(self._prompt_s, stop_s) - now_s, self._live.rest)
+        return waiting
 
     def _longest_turn_s(self) -> float:
         if self.get_clock().ros_time_is_active:
@@ -207,7 +216,16 @@ class BeaconNode(Node):
             return
         if self._shedder.hurries(waited_ns):
             self._live.hurry()
-        step = self._live.push(cdr, self._now_ns(), lambda early: self._give(early, arrival_ns))
+        try:
+            step = self._live.push(cdr, self._now_ns(), lambda early: self._give(early, arrival_ns))
+        except Exception:
+            self.survive('push')
+            self._failed += 1
+            if self._failed >= FAILED_IN_A_ROW:  # what is left of the state is of no use
+                self._open_stream()
+                self._failed = 0
+            return
+        self._failed = 0
         self.report.message(step, waited_ns / NS_PER_S)
         if step.lost_packets:
             self.log_warning('lost', f'{self._topic}: {step.lost_packets} packets lost', time.monotonic_ns())

@@ -26,7 +26,7 @@ from beacon_comm.ros.text import BeaconText, printable
 NAN = math.nan
 UNKNOWN_COVARIANCE = (-1.0, 0.0, 0.0, 0.0)
 _SEC_LOW, _SEC_HIGH = -(2**31), 2**31 - 1
-_FLOAT32_MAX = 3.4028234e38
+_FLOAT32_MAX = (2.0 - 2.0**-23) * 2.0**127
 # Little-endian CDR of a Characters message; int64 stands at multiples of 8 behind the encapsulation.
 _ENCAPSULATION = b'\x00\x01\x00\x00'
 _STAMP_AND_LENGTH = struct.Struct('<iII')
