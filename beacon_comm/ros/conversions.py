@@ -22,14 +22,13 @@ from beacon_comm.core.tracks import Covariance
 from beacon_comm.msg import Beacon, Beacons, Bearing, Bearings, Confirmed, Text
 from beacon_comm.ros.stamped import Instant, StampedCharacter
 from beacon_comm.ros.text import BeaconText, printable
+from beacon_comm.wire.cdr import ENCAPSULATION, packed_header
 
 NAN = math.nan
 UNKNOWN_COVARIANCE = (-1.0, 0.0, 0.0, 0.0)
 _SEC_LOW, _SEC_HIGH = -(2**31), 2**31 - 1
 _FLOAT32_MAX = (2.0 - 2.0**-23) * 2.0**127
-# Little-endian CDR of a Characters message; int64 stands at multiples of 8 behind the encapsulation.
-_ENCAPSULATION = b'\x00\x01\x00\x00'
-_STAMP_AND_LENGTH = struct.Struct('<iII')
+# CDR of a Characters message (beacon_comm.wire.cdr); int64 stands at multiples of 8 behind the encapsulation.
 _TIME_AND_COUNT = struct.Struct('<qI')
 _TO_STAMP = struct.Struct('<IBB2xfiI')
 _TO_RATIOS = struct.Struct('<qfI')
@@ -62,8 +61,7 @@ def characters_cdr(at: Instant, frame_id: str, characters: Sequence[StampedChara
 
     The one output that somebody waits for: to fill in the message, and let rclpy take it apart again, takes four times as long.
     """
-    frame = frame_id.encode() + b'\0'
-    data = bytearray(_STAMP_AND_LENGTH.pack(*_seconds(at.ros_ns), len(frame)) + frame)
+    data = packed_header(*_seconds(at.ros_ns), frame_id)
     data += bytes(-len(data) % 8)
     data += _TIME_AND_COUNT.pack(at.sensor_ns, len(characters))
     for track_id, character, began in characters:
@@ -72,7 +70,7 @@ def characters_cdr(at: Instant, frame_id: str, characters: Sequence[StampedChara
         data += bytes(-len(data) % 8)
         data += _TO_RATIOS.pack(began.sensor_ns, _float32(character.bit_rate_bps), len(ratios))
         data += struct.pack(f'<{len(ratios)}f', *map(_float32, ratios))
-    return _ENCAPSULATION + data
+    return ENCAPSULATION + data
 
 
 def text_message(frame_id: str, text: BeaconText) -> Text:

@@ -30,14 +30,15 @@ from numpy.typing import NDArray
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.wire.errors import WireError
 
-ENCAPSULATION_BYTES = 4
 CDR_LITTLE_ENDIAN = b'\x00\x01'
+ENCAPSULATION = CDR_LITTLE_ENDIAN + b'\x00\x00'
 EVENT_STRIDE_BYTES = 16
 LAST_EVENT_BYTES = 13
 """An Event is 13 bytes; the next one's x follows after one byte of padding, two before the stride's boundary."""
 MAX_TIME_BASE_NS = 1 << 62
 MOST_TEXT_BYTES = 256
 
+_STAMP = struct.Struct('<iI')
 _STAMP_AND_LENGTH = struct.Struct('<iII')
 _SIZE = struct.Struct('<II')
 _SEQ_AND_BASE = struct.Struct('<QQ')
@@ -150,7 +151,7 @@ def build_event_packet(
     data += _packed_string(encoding) + b'\x00'
     data += bytes(-len(data) % 4)
     body = payload.tobytes() if isinstance(payload, np.ndarray) else bytes(payload)
-    return CDR_LITTLE_ENDIAN + b'\x00\x00' + bytes(data) + _UINT32.pack(len(body)) + body
+    return ENCAPSULATION + bytes(data) + _UINT32.pack(len(body)) + body
 
 
 def build_event_array(
@@ -182,17 +183,22 @@ def build_event_array(
     if len(x):
         struct.pack_into('<HH', body, 0, int(x[0]), int(y[0]))
         del body[len(body) - EVENT_STRIDE_BYTES + LAST_EVENT_BYTES :]
-    return CDR_LITTLE_ENDIAN + b'\x00\x00' + bytes(data + body)
+    return ENCAPSULATION + bytes(data + body)
+
+
+def packed_header(sec: int, nanosec: int, frame_id: str) -> bytearray:
+    """Return the fields of a ``std_msgs/Header``, which a message begins with, behind the encapsulation."""
+    return bytearray(_STAMP.pack(sec, nanosec) + _packed_string(frame_id))
 
 
 def _contents(cdr: Bytes) -> memoryview:
     """Return what stands behind the encapsulation."""
     view = memoryview(cdr).cast('B') if not isinstance(cdr, bytes) else memoryview(cdr)
-    if len(view) < ENCAPSULATION_BYTES:
+    if len(view) < len(ENCAPSULATION):
         raise WireError('truncated', f'{len(view)} bytes: shorter than the encapsulation')
     if view[:2] != CDR_LITTLE_ENDIAN:
         raise WireError('encapsulation', f'encapsulation {bytes(view[:2]).hex()}: not little-endian CDR (0001)')
-    return view[ENCAPSULATION_BYTES:]
+    return view[len(ENCAPSULATION) :]
 
 
 def _header_and_size(view: memoryview) -> tuple[int, str, int, int, int]:
@@ -225,7 +231,6 @@ def _packed_string(text: str) -> bytes:
 
 def _start(stamp_ns: int, frame_id: str, width: int, height: int) -> bytearray:
     """Return the fields up to width, without the encapsulation."""
-    sec, nanosec = divmod(stamp_ns, NS_PER_S)
-    data = bytearray(struct.pack('<iI', sec, nanosec) + _packed_string(frame_id))
+    data = packed_header(*divmod(stamp_ns, NS_PER_S), frame_id)
     data += bytes(-len(data) % 4)
     return data + _SIZE.pack(height, width)
