@@ -160,8 +160,8 @@ class BeaconNode(Node):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._tick_s = own.silent_clock_after_s / 2.0
         self._prompt_timers = [
-            (self.create_timer(period_s, callback, clock=steady), callback)
-            for period_s, callback in ((self._tick_s, self._on_tick), (1.0 / own.publish_rate_hz, self._on_publish))
+            self.create_timer(self._tick_s, self._on_tick, clock=steady),
+            self.create_timer(1.0 / own.publish_rate_hz, self._on_publish, clock=steady),
         ]
         self._prompt_s = 0.0  # when to look at these again (s, monotonic clock)
         self.create_timer(GRAPH_PERIOD_S, self._on_graph, clock=steady)
@@ -198,12 +198,12 @@ class BeaconNode(Node):
 
     def _call_prompt_timers(self) -> float:
         """Call back, as the executor would, the timers that messages are not to hold up; return how long the next has (s)."""
-        for timer, callback in self._prompt_timers:
+        for timer in self._prompt_timers:
             if timer.is_ready():
                 with timer.handle:
                     timer.handle.call_timer()
-                callback()
-        return min(max(timer.time_until_next_call() or 0, 0) for timer, _ in self._prompt_timers) / NS_PER_S
+                timer.callback()
+        return min(max(timer.time_until_next_call() or 0, 0) for timer in self._prompt_timers) / NS_PER_S
 
     @guarded
     def _read(self, cdr: bytes, info: dict[str, int]) -> None:
