@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -124,6 +124,11 @@ class _Slot:
     carried_on: Gaps
     read_to_ns: int | None
     """End of the last character that was given out or erased, in this turn or the ones before it."""
+    searching: Searching | None = field(init=False)
+    """The demodulator, if it is one that searches: asked once, for asking a protocol takes long."""
+
+    def __post_init__(self) -> None:
+        self.searching = self.demodulator if isinstance(self.demodulator, Searching) else None
 
     def judge(self, track_id: int, characters: list[Character]) -> list[ReceivedCharacter]:
         received = []
@@ -145,8 +150,7 @@ class _Slot:
             self.demodulator.miss(start_ns, stop_ns)
 
     def ending(self, track_id: int) -> Iterator[list[ReceivedCharacter] | float]:
-        demodulator = self.demodulator
-        for part in demodulator.ending() if isinstance(demodulator, Searching) else [demodulator.flush()]:
+        for part in self.searching.ending() if self.searching is not None else [self.demodulator.flush()]:
             yield part if isinstance(part, float) else self.judge(track_id, part)
 
 
@@ -372,14 +376,14 @@ class CandidateSlots:
     def _share_search_load(self, more: int, t_ns: int) -> float:
         """Share what may be spent on searching among the slots without a bit rate, and so many more; return each one's."""
         searching = [
-            slot.demodulator
+            slot.searching
             for slot in self._slots.values()
-            if isinstance(slot.demodulator, Searching) and slot.demodulator.bit_rate_bps is None
+            if slot.searching is not None and slot.demodulator.bit_rate_bps is None
         ]
         shares = len(searching) + more + (WEIGHT if self._last_looks.track_ids else 0)
         load = self.search_share * self._p.search_load / max(1, shares)
-        for demodulator in searching:
-            demodulator.share(load, t_ns)
+        for one in searching:
+            one.share(load, t_ns)
         return load
 
     def _give(
@@ -391,10 +395,10 @@ class CandidateSlots:
         slot = _Slot(self._make_demodulator(self._p), ParityRecord(self._p), self._gaps, self._carried_on, read_to_ns)
         self._slots[track_id] = slot
         slot.record.advance(t_ns, quiet=False)
-        if isinstance(slot.demodulator, Searching):
-            slot.demodulator.share(search_load, t_ns)
+        if slot.searching is not None:
+            slot.searching.share(search_load, t_ns)
             if tried is not None:
-                slot.demodulator.searched(tried.ended_ns)
+                slot.searching.searched(tried.ended_ns)
         received = self._last_looks.finish(track_id)
         for start_ns, stop_ns in self._gaps.since(int(times[first])) if first < len(times) else ():
             stop = max(first, int(np.searchsorted(times, start_ns, 'right')))
