@@ -128,6 +128,7 @@ CHAIN = (
     # key, sensor, background (events/s), index_threshold
     ('', HD, 20e6, DENSE),
     ('vga_', VGA, 8e6, DENSE),
+    ('vga_20mev_', VGA, 20e6, 5.0),  # 65 events a second and pixel
     ('40mev_', HD, 40e6, DENSE),
     ('default_threshold_', HD, 7e6, 0.6),
     ('sparse_vga_', VGA, 1e6, 0.6),
