@@ -210,6 +210,7 @@ class BeaconNode(Node):
         # A middleware that does not stamp arrivals gives 0: then nothing is known to have waited.
         arrival_ns = info['received_timestamp'] or time.time_ns()
         waited_ns = time.time_ns() - arrival_ns
+        begun_ns = time.monotonic_ns()  # the host's clock may be set meanwhile
         if self._shedder.sheds(waited_ns):
             self._live.shed(self._now_ns())
             self.report.shed()
@@ -232,9 +233,9 @@ class BeaconNode(Node):
         if step.problem is not None:
             self.log_warning(step.problem_kind, f'{self._topic}: {step.problem}', time.monotonic_ns())
         self._give(step, arrival_ns)
-        lag_ns = time.time_ns() - arrival_ns
-        self._shedder.read(lag_ns - waited_ns)
-        self.report.published(lag_ns / NS_PER_S)
+        took_ns = time.monotonic_ns() - begun_ns
+        self._shedder.read(took_ns)
+        self.report.published((waited_ns + took_ns) / NS_PER_S)
 
     @guarded
     def _give(self, step: Step, arrival_ns: int) -> None:
