@@ -241,6 +241,32 @@ def test_a_cache_that_cannot_be_made_is_replaced(tmp_path: Path) -> None:
     assert folder.parent.parent == tmp_path and stat.S_IMODE(folder.parent.stat().st_mode) == 0o700
 
 
+@pytest.mark.parametrize('disk', ['full', 'read-only'])
+def test_kernels_that_cannot_be_kept_run_all_the_same(tmp_path: Path, disk: str) -> None:
+    """The disk runs full, or there is no folder to write to, the temporary ones included."""
+    program = (
+        'import resource, signal, sys, tempfile\n'
+        'from pathlib import Path\n'
+        'import beacon_comm.compiling.cache as cache\n'
+        'cache.PACKAGE = Path("/proc/nowhere")\n'
+        'full = sys.argv[1] == "full"\n'
+        'if not full:\n'
+        '    tempfile._candidate_tempdir_list = lambda: ["/proc/nowhere"]\n'
+        'folder = cache.ensure_compiler_cache()\n'
+        'assert full == (folder is not None), folder\n'
+        'if full:\n'
+        '    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n'
+        '    resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))\n'
+        'cache.save_one_at_a_time()\n'
+        'from beacon_comm.core.motion import fading_s\n'
+        'assert fading_s(0.5) == fading_s.py_func(0.5)\n'
+    )
+    environment = {
+        **os.environ, 'XDG_CACHE_HOME': '/proc/nowhere', 'NUMBA_CACHE_DIR': '/proc/nowhere', 'TMPDIR': str(tmp_path),
+    }
+    subprocess.run([sys.executable, '-P', '-c', program, disk], env=environment, check=True)
+
+
 def test_every_version_has_kernels_of_its_own(tmp_path: Path) -> None:
     """A kernel that was compiled against a type that is gone would keep the node from starting."""
     package = tmp_path / 'beacon_comm'
