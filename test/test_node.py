@@ -15,6 +15,7 @@ rclpy = pytest.importorskip('rclpy')
 messages = pytest.importorskip('beacon_comm.msg')
 EventPacket = pytest.importorskip('event_camera_msgs.msg').EventPacket
 
+import node_process  # noqa: E402
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from live_session import pixel_events  # noqa: E402
 from node_process import DOMAIN, START_TIMEOUT_S, NodeProcess, Peer  # noqa: E402
@@ -369,6 +370,20 @@ REFUSALS = [
     (['-p', 'bit_rates:=[504.0, 19.0]'], 'bit_rates = 19.0: must lie in [20, 10000] bps'),
     (['-p', 'camera_info_file:=/no/such/file.yaml'], '/no/such/file.yaml'),
 ]
+
+
+def test_it_starts_without_a_folder_for_logs(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, start: Callable[..., NodeProcess]
+) -> None:
+    """A robot whose disk is read-only, and a user without a home."""
+    without = {**node_process.environment(folder), 'HOME': '/proc/nowhere'}
+    del without['ROS_LOG_DIR']
+    monkeypatch.setattr(node_process, 'environment', lambda _: without)
+    node = start()
+    node.wait_for('waiting for events on')
+    assert '/proc/nowhere/.ros/log cannot be written' in node.output()
+    node.process.send_signal(signal.SIGINT)
+    assert node.exit_code() == 0, node.output()
 
 
 def test_a_wrong_value_is_refused_in_one_line(start: Callable[..., NodeProcess]) -> None:

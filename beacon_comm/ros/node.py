@@ -7,6 +7,7 @@ calibration is refused.
 from __future__ import annotations
 
 import gc
+import os
 import signal
 import sys
 from collections.abc import Sequence
@@ -54,6 +55,22 @@ def main(args: Sequence[str] | None = None) -> int:
         stop.ignore()
 
 
+def _with_a_log(args: Sequence[str]) -> list[str]:
+    """Return the arguments; where the folder for logs cannot be made, without which rcl would not start, with none wanted."""
+    folder = os.environ.get('ROS_LOG_DIR') or os.path.join(os.environ.get('ROS_HOME') or '~/.ros', 'log')
+    if folder.startswith('~'):
+        folder = os.environ.get('HOME', '/proc/no home') + folder[1:]  # rcl asks nobody else
+    try:
+        os.makedirs(folder, exist_ok=True)
+        kept = os.access(folder, os.W_OK)
+    except OSError:
+        kept = False
+    if kept:
+        return list(args)
+    print(f'{folder} cannot be written, no log is kept (ROS_LOG_DIR)', file=sys.stderr)
+    return [*args, '--ros-args', '--disable-external-lib-logs']
+
+
 def _run(args: Sequence[str] | None, stop: StopSignal) -> int:
     from beacon_comm.compiling.cache import ensure_compiler_cache
 
@@ -66,7 +83,7 @@ def _run(args: Sequence[str] | None, stop: StopSignal) -> int:
     from beacon_comm.ros.beacon_node import NODE_NAME, BeaconNode
 
     try:
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(args=_with_a_log(sys.argv if args is None else args), signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rcl's own: a parameter file or rule that cannot be parsed
         print(f'{NODE_NAME}: {str(error).splitlines()[0]}', file=sys.stderr)
         return EXIT_REFUSED
