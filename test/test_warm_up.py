@@ -10,7 +10,7 @@ import importlib, pkgutil, sys
 import numpy as np
 from numba.core.registry import CPUDispatcher
 import beacon_comm.core, beacon_comm.wire
-from beacon_comm.compiling.warm_up import synthetic_beacon, warm_up
+from beacon_comm.compiling.warm_up import synthetic_beacons, warm_up
 from beacon_comm.core.events import NS_PER_S, EventBatch
 from beacon_comm.core.parameters import Parameters
 from beacon_comm.core.receiver import Receiver
@@ -25,11 +25,11 @@ def compiled():
                if isinstance(k, CPUDispatcher)}
     return {name: len(kernel.signatures) for name, kernel in kernels.items()}
 
-parameters = Parameters(receiver=sys.argv[1])
+parameters = Parameters(**eval(sys.argv[1]))
 warm_up(parameters)
 before = compiled()
 assert sum(before.values()) > 20, before
-size, events = (1280, 720), synthetic_beacon(parameters, 1.0)
+size, events = (1280, 720), synthetic_beacons(parameters, 1.0)
 rng = np.random.default_rng(1)
 n = 20_000
 noise = EventBatch(rng.integers(0, 1280, n).astype(np.uint16), rng.integers(0, 720, n).astype(np.uint16),
@@ -44,22 +44,35 @@ for seq, begin in enumerate(cuts):
     start, stop = np.searchsorted(scene.t_ns, (begin, begin + 4_000_000))
     part = scene.slice(start, stop, begin + 4_000_000)
     cdr = build_event_packet(begin, 'camera', *size, seq, 0, 'evt3', encoder.encode(part))
+    if 140 < seq < 145:
+        continue  # missing
     receiver.push(packets.push(bytearray(cdr) if seq % 2 else cdr).batch)
     arrays.push(build_event_array(begin, 'camera', *size, part.x, part.y, part.polarity, part.t_ns))
-assert arrays.counts['events'] == packets.counts['events'] == len(scene)
+assert arrays.counts['events'] == packets.counts['events'] > 0.9 * len(scene)
+assert packets.counts['lost_packets'] == 4
 for encoding in ('libcaer_cmp', 'libcaer', 'mono'):
     cdr = build_event_packet(0, 'camera', *size, 0, 0, encoding, rng.bytes(6401))
     EventStream('event_camera_msgs/msg/EventPacket').push(cdr)
 assert receiver.beacons()
+receiver.push(EventBatch.empty(cuts[-1] + 2 * NS_PER_S))
 receiver.flush()
 after = compiled()
 assert after == before, {k: (before.get(k), n) for k, n in after.items() if before.get(k) != n}
 """
 
 
-@pytest.mark.parametrize('receiver', ['threshold', 'sequence'])
-def test_nothing_is_compiled_after_the_warm_up(receiver: str) -> None:
+@pytest.mark.parametrize(
+    'parameters',
+    [
+        {'receiver': 'threshold'},
+        {'receiver': 'sequence'},
+        {'tracker': 'nearest'},
+        {'receiver': 'threshold', 'bit_rates': (20.0,)},
+        {'short_window_s': 0.3, 'long_window_bits': 1.0, 'hop_s': 0.1},
+    ],
+)
+def test_nothing_is_compiled_after_the_warm_up(parameters: dict[str, object]) -> None:
     done = subprocess.run(
-        [sys.executable, '-P', '-c', SCRIPT, receiver], capture_output=True, text=True, timeout=200, check=False
+        [sys.executable, '-P', '-c', SCRIPT, repr(parameters)], capture_output=True, text=True, timeout=200, check=False
     )
     assert done.returncode == 0, done.stderr[-2000:]

@@ -1,16 +1,20 @@
-"""Runs every compiled kernel once on a made-up beacon, so that the first real packet does not wait for the compiler.
+"""Runs every compiled kernel once on made-up beacons, so that the first real packet does not wait for the compiler.
 
 ::
 
-    . . . . . . . . .      16 x 16 pixels; a 5 x 5 block fires +1 at every rise of the line and -1 at every fall
-    . . o o o o o . .
+    . . . . . . . . . . . . . .      320 x 16 pixels; two 5 x 5 blocks fire +1 at every rise of their line and -1 at every fall;
+    . . o o o o o . . o o o o o      the second one comes later, the first one runs past it in the end; packets are missing
+             ───────────►            once, and both fall silent
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from beacon_comm.compiling.cache import save_one_at_a_time
+from beacon_comm.core import motion
 from beacon_comm.core.events import NS_PER_S, EventBatch
 from beacon_comm.core.framing import CharacterFrame, transitions
 from beacon_comm.core.parameters import Parameters
@@ -19,68 +23,100 @@ from beacon_comm.wire.cdr import build_event_array, build_event_packet
 from beacon_comm.wire.evt3_encoder import Evt3Encoder
 from beacon_comm.wire.stream import PACKET_TYPES, EventStream
 
-SIZE = 16
-PACKETS = 8
+WIDTH, HEIGHT = 320, 16
+LEFT = (30, 60)
+SPEED_PX_PER_S = 1000
+PACKETS, MISSING = 24, 16
+SILENCE_NS = NS_PER_S // 2
 ARRAY_TYPE = 'dvs_msgs/msg/EventArray'
 ENCODINGS = ('libcaer_cmp', 'libcaer', 'mono')
 
 
-def synthetic_beacon(parameters: Parameters, seconds: float = 0.6) -> EventBatch:
-    """Return events of a beacon that sends at the fastest listed rate, from 1 s on the sensor's clock."""
+def synthetic_beacons(parameters: Parameters, seconds: float = 0.6, beacons: int = len(LEFT)) -> EventBatch:
+    """Return events of one or two beacons that send at the fastest listed rate, from 1 s on the sensor's clock."""
     bit_rate_bps = max(parameters.bit_rates)
     frame = CharacterFrame.from_parameters(parameters)
     count = max(3, round(seconds * bit_rate_bps / frame.length))
     bits = frame.encode_bits(('Warm up ' * (count // 8 + 1))[:count])
     edges_ns, levels = transitions(bits, bit_rate_bps, NS_PER_S)
-    x, y = (grid.ravel() for grid in np.meshgrid(np.arange(5, 10), np.arange(5, 10)))
-    pixels = len(x)
+    column, row = (grid.ravel() for grid in np.meshgrid(np.arange(5), np.arange(5, 10)))
+    parts = []
+    for k in range(beacons):
+        late_ns = round(0.5 * k * frame.length * NS_PER_S / bit_rate_bps)  # by half a character
+        kept = edges_ns >= edges_ns[len(edges_ns) * k // 3]
+        t_ns = np.repeat(edges_ns[kept] + late_ns, len(row))
+        moving_ns = np.maximum(t_ns - t_ns[2 * len(t_ns) // 3], 0) * (k == 0)
+        left = np.minimum(LEFT[k] + SPEED_PX_PER_S * moving_ns // NS_PER_S, WIDTH - 5)
+        edges = int(kept.sum())
+        parts.append((np.tile(column, edges) + left, np.tile(row, edges), np.repeat(levels[kept] > 0, len(row)), t_ns))
+    x, y, rises, t_ns = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    order = np.argsort(t_ns, kind='stable')
     return EventBatch(
-        np.tile(x, len(edges_ns)).astype(np.uint16),
-        np.tile(y, len(edges_ns)).astype(np.uint16),
-        np.repeat(np.where(levels > 0, 1, -1), pixels).astype(np.int8),
-        np.repeat(edges_ns, pixels).astype(np.int64),
-        int(edges_ns[-1]) + NS_PER_S // 10,
+        x[order].astype(np.uint16),
+        y[order].astype(np.uint16),
+        np.where(rises[order], 1, -1).astype(np.int8),
+        t_ns[order].astype(np.int64),
+        int(t_ns.max()) + NS_PER_S // 10,
     )
 
 
 def warm_up(parameters: Parameters, pixels: bool = True) -> None:
-    """Push a synthetic beacon through the reader of every encoding and through a receiver of its own.
+    """Push synthetic beacons through the reader of every encoding and through a receiver of its own.
+
+    What a receiver comes to depends on its parameters: at 20 bit/s nothing is read within a second.  So one with the default
+    rates and windows follows, which comes to everything.
 
     Args:
         parameters: the receiver's.
         pixels: False: for signals without pixels only, which need neither readers nor detection.
     """
     save_one_at_a_time()
-    events = synthetic_beacon(parameters)
+    some = Parameters(receiver=parameters.receiver, tracker=parameters.tracker)
+    for rehearsed in dict.fromkeys((parameters, some)):
+        if pixels:
+            _rehearse(rehearsed)
+        else:
+            signal_receiver = SignalReceiver(rehearsed)
+            signal_receiver.push(synthetic_beacons(rehearsed, beacons=1))
+            signal_receiver.flush()
     if not pixels:
-        signal_receiver = SignalReceiver(parameters)
-        signal_receiver.push(events)
-        signal_receiver.flush()
         return
-    receiver = Receiver(parameters, (SIZE, SIZE))
-    stream, encoder = EventStream(PACKET_TYPES[0]), Evt3Encoder(SIZE, SIZE)
-    cuts = np.linspace(0, len(events), PACKETS + 1).astype(int)
-    for sequence, (start, stop) in enumerate(zip(cuts[:-1], cuts[1:], strict=True)):
-        end_ns = events.t_end_ns if stop == len(events) else int(events.t_ns[stop])
-        part = events.slice(start, stop, end_ns)
-        stream.push(_packet('evt3', encoder.encode(part), sequence))
-        receiver.push(part)
-    receiver.flush()
-    receiver.beacons()
+    motion.observe(np.ones(motion.WIDTH), 0.0, 0.0, 0.0, 1.0)  # else for a blob that mostly lies outside its track's circle
+    events = synthetic_beacons(some)
     for encoding in ENCODINGS:
         EventStream(PACKET_TYPES[0]).push(_packet(encoding, bytes(64), 0))
     few = events.slice(0, 3, events.t_end_ns)
     EventStream(ARRAY_TYPE).push(
-        build_event_array(NS_PER_S, 'warm_up', SIZE, SIZE, few.x, few.y, few.polarity, few.t_ns)
+        build_event_array(NS_PER_S, 'warm_up', WIDTH, HEIGHT, few.x, few.y, few.polarity, few.t_ns)
     )
+
+
+def _rehearse(parameters: Parameters) -> None:
+    events = synthetic_beacons(parameters)
+    receiver = Receiver(parameters, (WIDTH, HEIGHT))
+    stream, encoder = EventStream(PACKET_TYPES[0]), Evt3Encoder(WIDTH, HEIGHT)
+    cuts = np.linspace(0, len(events), PACKETS + 1).astype(int)
+    for sequence, (start, stop) in enumerate(zip(cuts[:-1], cuts[1:], strict=True)):
+        if sequence == MISSING:
+            continue
+        end_ns = events.t_end_ns if stop == len(events) else int(events.t_ns[stop])
+        part = events.slice(start, stop, end_ns)
+        stream.push(_packet('evt3', encoder.encode(part), sequence))
+        if sequence == MISSING + 1:
+            part = replace(part, missing_until_ns=int(part.t_ns[0]))
+        receiver.push(part)
+        receiver.rest()
+    receiver.push(EventBatch.empty(events.t_end_ns + SILENCE_NS))
+    receiver.beacons()
+    receiver.flush()
 
 
 def _packet(encoding: str, payload: bytes, sequence: int) -> bytes:
     return build_event_packet(
         stamp_ns=NS_PER_S,
         frame_id='warm_up',
-        width=SIZE,
-        height=SIZE,
+        width=WIDTH,
+        height=HEIGHT,
         seq=sequence,
         time_base_ns=0,
         encoding=encoding,
