@@ -57,6 +57,7 @@ FAINT = replace(
 NEAR_PX = 8.0
 MATCH_SHARE = 0.25
 TOLERANCE_NS = 1_000_000
+LEAST_SIZES, MOST_GROWTH = 3, 1.05
 LAMP_HZ, LAMP_SHARE = 100.0, 0.3
 STAMP_NS = 1_700_000_000 * NS_PER_S
 TYPE = 'event_camera_msgs/msg/EventPacket'
@@ -231,6 +232,15 @@ def resident_mib() -> float:
     return pages * os.sysconf('SC_PAGE_SIZE') / 2**20
 
 
+def growth(sizes_mib: list[float]) -> list[str]:
+    """Return a broken promise if the last third of the sizes (MiB) is above the middle one; too few tell nothing."""
+    third = len(sizes_mib) // 3
+    if third < LEAST_SIZES:
+        return []
+    before, after = (float(np.median(part)) for part in (sizes_mib[third:-third], sizes_mib[-third:]))
+    return [f'memory grew from {before:.0f} to {after:.0f} MiB'] if after > before * MOST_GROWTH else []
+
+
 def run(minutes: float, seed: int, quiet: bool = False) -> Tally:
     """Run so many minutes of events."""
     hour = Hour(seed)
@@ -259,6 +269,7 @@ def main() -> int:
     print(f'characters of confirmed beacons: {counts["right"]} right and OK, {counts["wrong"]} wrong and OK')
     shown = [f'{size:.0f}' for size in tally.sizes_mib[:: max(len(tally.sizes_mib) // 12, 1)]]
     print(f'memory held (MiB), over the time: {", ".join(shown)}')
+    tally.problems += growth(tally.sizes_mib)
     for problem in tally.problems:
         print(f'broken: {problem}')
     return 1 if tally.problems else 0

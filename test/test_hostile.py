@@ -49,6 +49,11 @@ def test_files(tmp_path: Path) -> None:
     assert all(tally['read'] + tally['refused'] + tally['read in part'] for tally in counts.values())
 
 
+def test_memory_that_grows_is_a_broken_promise() -> None:
+    assert endurance.growth([657, 670, 660, 672, 676, 675, 667, 683, 680, 661, 671, 674]) == []
+    assert endurance.growth([600.0 + 10.0 * k for k in range(12)]) and not endurance.growth([1.0, 2.0, 3.0])
+
+
 def test_beacons_come_and_go() -> None:
     tally = endurance.run(0.4, 3, quiet=True)
     assert tally.problems == []
