@@ -174,10 +174,19 @@ class Listener:
         rclpy.init(context=self._context, domain_id=domain)
         self._node = rclpy.create_node('listener', context=self._context)
         best_effort = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.BEST_EFFORT)
-        self._node.create_subscription(EventPacket, TOPIC, self._take, best_effort, raw=True)
+        self._events = self._node.create_subscription(EventPacket, TOPIC, self._take, best_effort, raw=True)
         self._node.create_subscription(Clock, '/clock', self._take_clock, best_effort)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
+
+    def insist(self) -> None:
+        """Lose nothing from now on, of a publisher that is reliable."""
+        from event_camera_msgs.msg import EventPacket
+        from rclpy.qos import QoSProfile, QoSReliabilityPolicy
+
+        self._node.destroy_subscription(self._events)
+        reliable = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.RELIABLE)
+        self._events = self._node.create_subscription(EventPacket, TOPIC, self._take, reliable, raw=True)
 
     def _take(self, raw: bytes) -> None:
         self.received.append((time.monotonic(), bytes(raw)))
@@ -270,6 +279,7 @@ def test_a_bag_is_published_unchanged_at_its_pace(bag: Path, listener: Listener)
 
 
 def test_a_scene_is_published_and_remapped(mat: Path, tmp_path: Path, listener: Listener) -> None:
+    listener.insist()
     replay = Replay(mat, '--rate', '0', '--reliable', '--topic', '/elsewhere', '--ros-args', '-r', f'/elsewhere:={TOPIC}')
     try:
         listener.hear(100, replay)
