@@ -9,8 +9,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from beacon_comm.compiling.cache import save_one_at_a_time
@@ -72,13 +70,9 @@ def warm_up(parameters: Parameters, pixels: bool = True) -> None:
     """
     save_one_at_a_time()
     some = Parameters(receiver=parameters.receiver, tracker=parameters.tracker)
+    rehearse = _rehearse if pixels else _rehearse_signal
     for rehearsed in dict.fromkeys((parameters, some)):
-        if pixels:
-            _rehearse(rehearsed)
-        else:
-            signal_receiver = SignalReceiver(rehearsed)
-            signal_receiver.push(synthetic_beacons(rehearsed, beacons=1))
-            signal_receiver.flush()
+        rehearse(rehearsed)
     if not pixels:
         return
     motion.observe(np.ones(motion.WIDTH), 0.0, 0.0, 0.0, 1.0)  # else for a blob that mostly lies outside its track's circle
@@ -100,14 +94,18 @@ def _rehearse(parameters: Parameters) -> None:
         if sequence == MISSING:
             continue
         end_ns = events.t_end_ns if stop == len(events) else int(events.t_ns[stop])
-        part = events.slice(start, stop, end_ns)
-        stream.push(_packet('evt3', encoder.encode(part), sequence))
-        if sequence == MISSING + 1:
-            part = replace(part, missing_until_ns=int(part.t_ns[0]))
-        receiver.push(part)
+        batch = stream.push(_packet('evt3', encoder.encode(events.slice(start, stop, end_ns)), sequence)).batch
+        if batch is not None:
+            receiver.push(batch)
         receiver.rest()
     receiver.push(EventBatch.empty(events.t_end_ns + SILENCE_NS))
     receiver.beacons()
+    receiver.flush()
+
+
+def _rehearse_signal(parameters: Parameters) -> None:
+    receiver = SignalReceiver(parameters)
+    receiver.push(synthetic_beacons(parameters, beacons=1))
     receiver.flush()
 
 
