@@ -163,7 +163,6 @@ class Listener:
 
     def __init__(self, domain: int) -> None:
         import rclpy
-        from event_camera_msgs.msg import EventPacket
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.qos import QoSProfile, QoSReliabilityPolicy
         from rosgraph_msgs.msg import Clock
@@ -174,19 +173,22 @@ class Listener:
         rclpy.init(context=self._context, domain_id=domain)
         self._node = rclpy.create_node('listener', context=self._context)
         best_effort = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.BEST_EFFORT)
-        self._events = self._node.create_subscription(EventPacket, TOPIC, self._take, best_effort, raw=True)
+        self._events = self._subscribe(best_effort)
         self._node.create_subscription(Clock, '/clock', self._take_clock, best_effort)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
 
+    def _subscribe(self, qos: Any) -> Any:
+        from event_camera_msgs.msg import EventPacket
+
+        return self._node.create_subscription(EventPacket, TOPIC, self._take, qos, raw=True)
+
     def insist(self) -> None:
         """Lose nothing from now on, of a publisher that is reliable."""
-        from event_camera_msgs.msg import EventPacket
         from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 
         self._node.destroy_subscription(self._events)
-        reliable = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.RELIABLE)
-        self._events = self._node.create_subscription(EventPacket, TOPIC, self._take, reliable, raw=True)
+        self._events = self._subscribe(QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.RELIABLE))
 
     def _take(self, raw: bytes) -> None:
         self.received.append((time.monotonic(), bytes(raw)))
