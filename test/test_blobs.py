@@ -49,10 +49,10 @@ def test_components_are_those_of_opencv(seed, events, closing_px, grow):
     images = IndexImages(parameters, SIZE)
     finder = ComponentFinder(parameters, images.grid)
     images.push(packed(noise(*SIZE, 50_000, 0.005, seed=seed % 1000)))
-    finder.find(images.windows[0])  # leaves nothing behind
+    finder.find(images.windows[0], 0.5)  # leaves nothing behind
     images.push(packed(batch(x, y, rng.choice([-1, 1], events), np.full(events, T0_NS))))
     window = images.windows[0]
-    components = finder.find(window)
+    components = finder.find(window, images.threshold)
 
     index = images.index(window)
     low = (index >= 0.5 * grow).astype(np.uint8)

@@ -1,5 +1,7 @@
 """Detection end to end: events in, tracks and routed events out; any batching; real backgrounds."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from disc_events import HOP_NS, T0_NS, batch, detect, disc, merged, noise
@@ -35,7 +37,8 @@ def in_pieces(detector, events, cuts):
             routed.setdefault(track_id, []).append(part)
         if stop in at_hops:
             changes = detector.hop(t_hop)
-            seen.append((t_hop, [t.track_id for t in changes.new], [t.track_id for t in changes.lost]))
+            new, lost = ([track.track_id for track in tracks] for tracks in (changes.new, changes.lost))
+            seen.append((t_hop, new, lost, detector.index_threshold))
             seen.append([repr(track) for track in detector.tracks.values()])
             seen.append([tuple(column.tobytes() for column in detector.backlog(i)) for i in detector.tracks])
             t_hop += HOP_NS
@@ -47,15 +50,18 @@ def in_pieces(detector, events, cuts):
 
 
 SCENE = busy_scene()
+CLUTTERED = merged(SCENE, *(disc(15.0 + 20.0 * k, 105.0, start_s=0.1, duration_s=0.1, seed=k) for k in range(7)))
 BATCHING = Parameters(lost_after_s=0.05, bit_rates=(200.0, 3125.0))
 
 
 @settings(max_examples=20, deadline=None)
-@given(st.lists(st.integers(1, len(SCENE) - 1), max_size=60))
-def test_any_batching_gives_the_same(cuts):
-    whole = in_pieces(Detector(BATCHING, SIZE), SCENE, [])
-    assert in_pieces(Detector(BATCHING, SIZE), SCENE, cuts) == whole
-    assert len(whole[0]) >= 3 and any(lost for _, _, lost in whole[1][::3])
+@given(st.sampled_from([64, 1]), st.lists(st.integers(1, len(CLUTTERED) - 1), max_size=60))
+def test_any_batching_gives_the_same(new_tracks_burst, cuts):
+    parameters = replace(BATCHING, new_tracks_burst=new_tracks_burst)
+    whole = in_pieces(Detector(parameters, SIZE), CLUTTERED, [])
+    assert in_pieces(Detector(parameters, SIZE), CLUTTERED, cuts) == whole
+    assert len(whole[0]) >= 3 and any(lost for _, _, lost, _ in whole[1][::3])
+    assert any(threshold > 0.6 for _, _, _, threshold in whole[1][::3]) == (new_tracks_burst == 1)
 
 
 @pytest.mark.parametrize('rests', [1, 9])

@@ -56,6 +56,7 @@ def test_from_bytes_to_characters_both_do_the_same(seed: int, rate_per_s: float,
     receiver = Receiver(parameters, SIZE)
     reference = Receiver(parameters, SIZE, detection=ReferenceDetector(parameters, SIZE))
     seen = characters = 0
+    raised = False
     for seq, end_ns in enumerate(range(PACKET_NS, int(events.t_ns[-1]) + PACKET_NS, PACKET_NS)):
         start, stop = np.searchsorted(events.t_ns, (end_ns - PACKET_NS, end_ns))
         payload = encoder.encode(events.slice(start, stop, end_ns))
@@ -65,10 +66,12 @@ def test_from_bytes_to_characters_both_do_the_same(seed: int, rate_per_s: float,
         output = receiver.push(batch)
         assert output == reference.push(batch)
         assert receiver.beacons() == reference.beacons()
+        assert receiver.index_threshold == reference.index_threshold
+        raised |= receiver.index_threshold > parameters.index_threshold
         seen = max(seen, len(receiver.beacons()))
         characters += len(output.characters)
     assert receiver.flush() == reference.flush()
-    assert seen >= 3
+    assert seen >= 3 and raised == (rate_per_s > 1_000_000)  # by more tracks than may begin at once
 
 
 @pytest.mark.parametrize('name', ['evt3_static', 'evt3_trigger_hd'])

@@ -127,7 +127,7 @@ class BlobFinder:
         self._sets, self.box = [], np.empty((0, 4))
         if images.empty:
             return []
-        self._sets = [f.find(window) for f, window in zip(self._finders, images.windows, strict=False)]
+        self._sets = [f.find(window, images.threshold) for f, window in zip(self._finders, images.windows, strict=False)]
         window, sums, index = self._choose(images.windows)
         if len(window) == 0:
             return []

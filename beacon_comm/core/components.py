@@ -58,13 +58,12 @@ class ComponentFinder:
     """Finds the components of one window; keeps the images it works in.
 
     Args:
-        parameters: ``index_threshold``, ``index_offset``, ``closing_px``.
+        parameters: ``index_offset``, ``closing_px``.
         grid: how the sensor's pixels are numbered.
     """
 
     def __init__(self, parameters: Parameters, grid: PixelGrid) -> None:
         self._grid = grid
-        self._threshold = parameters.index_threshold
         self._offset = parameters.index_offset
         self._closing_px = parameters.closing_px
         self._wide = np.zeros((grid.height, grid.words), np.uint64)
@@ -72,15 +71,15 @@ class ComponentFinder:
         self._label = np.zeros(grid.numbers, np.int32)
         self._run = np.empty((0, 2), np.int32)
 
-    def find(self, window: Window) -> ComponentSet:
-        """Return the components of ``window``; the label image is valid until the next call."""
+    def find(self, window: Window, threshold: float) -> ComponentSet:
+        """Return the components of ``window``, with their pixels above a threshold; labels are valid until the next call."""
         paint(self._run, self._label, 0)
         bits = window.low
         if self._closing_px > 1:
             _close(bits, self._closing_px, self._grid.width, self._wide, self._closed)
             bits = self._closed
         self._run, first, sums, index = _find_components(
-            bits, self._grid.width, self._grid.shift, window.planes, window.used, self._threshold, self._offset, self._label
+            bits, self._grid.width, self._grid.shift, window.planes, window.used, threshold, self._offset, self._label
         )
         return ComponentSet(self._label, self._run, first, sums, index)
 

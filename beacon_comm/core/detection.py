@@ -4,6 +4,8 @@
                  │  ▲
            hop   ▼  │ aim
            index images ──► blobs ──► tracks
+                 ▲                      │ new ones
+                 └── threshold ◄── clutter
 
 Routing in a hop interval depends on nothing but the tracks at the last hop, and everything else happens at hops, so
 any batching of the same events gives the same tracks and the same routed events.  What nobody waits for at a hop, the upkeep of
@@ -20,6 +22,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from beacon_comm.core.blobs import Blob, BlobFinder
+from beacon_comm.core.clutter import Clutter
 from beacon_comm.core.event_buffer import EventBuffer, buffer_length_ns
 from beacon_comm.core.events import EventBatch
 from beacon_comm.core.following import FollowingRouter
@@ -59,7 +62,7 @@ class DetectionStats:
         events, routed_events: events taken, and those of them that were routed to a track.
         outside_events: events beyond the sensor's borders.
         blobs: blobs of the last hop.
-        waiting_blobs: blobs of the last hop that got no track because ``max_tracks`` are kept.
+        waiting_blobs: blobs of the last hop that got no track because ``max_tracks`` are kept, or too many began.
         new_tracks, lost_tracks: tracks that began and ended.
         window_overflow_events: events dropped from the windows (``window_max_bytes``).
         buffer_overflow_events: events dropped from buffers (``buffer_max_bytes``).
@@ -104,6 +107,8 @@ class Detector:
         self._blobs = BlobFinder(self._parameters, sensor_size)
         make_router = FollowingRouter if self._follows else Router
         self._router: Router = make_router(self._parameters, sensor_size)
+        self._clutter = Clutter(self._parameters)
+        self._heed_clutter()
         self._t_hop_ns: int | None = None  # the last point of the hop grid
         self._early = TrackChanges()  # changes at hops that route() had to catch up with
         self._to_exchange: list[tuple[int, int]] = []
@@ -118,6 +123,11 @@ class Detector:
     def idle(self) -> bool:
         """Whether nothing can change at coming hops without events: no track, and no event in any window."""
         return not self._tracker.tracks and self._images.empty and not self._router.gathered
+
+    @property
+    def index_threshold(self) -> float:
+        """The index threshold now; clutter raises it."""
+        return self._clutter.threshold
 
     @property
     def stats(self) -> DetectionStats:
@@ -221,6 +231,8 @@ class Detector:
         blobs = self._blobs.find(self._images, t_hop_ns, self._router.near)
         changes = self._tracker.update(blobs, t_hop_ns)
         self._router.aim(tuple(self._tracker.tracks.values()), t_hop_ns)
+        self._clutter.count(len(changes.new_blobs), t_hop_ns)
+        self._heed_clutter()
         self._untidied = _Untidied(routed, exchanged, blobs, changes, t_hop_ns)
         self._stats.hops += 1
         self._stats.blobs = len(blobs)
@@ -228,6 +240,11 @@ class Detector:
         self._stats.new_tracks += len(changes.new)
         self._stats.lost_tracks += len(changes.lost)
         return changes
+
+    def _heed_clutter(self) -> None:
+        """Let the tracks that began set the threshold of the hops to come."""
+        self._tracker.threshold, self._tracker.most_new = self._clutter.threshold, self._clutter.most_new
+        self._images.set_threshold(self._clutter.threshold)
 
     def _exchange(self) -> list[tuple[int, int]]:
         """Exchange the tracks that are to be; return them."""

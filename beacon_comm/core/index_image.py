@@ -89,6 +89,7 @@ class IndexImages:
 
     Attributes:
         grid: how pixels are numbered.
+        threshold: what a blob has a pixel of; see :meth:`set_threshold`.
         windows: the short window, then the long one unless it is no longer than the short one.
         overflow_events: events dropped from the windows because the ring reached ``window_max_bytes``.
     """
@@ -97,7 +98,8 @@ class IndexImages:
         self.grid = PixelGrid(*sensor_size)
         self._max_bytes = parameters.window_max_bytes
         self._offset = parameters.index_offset
-        self._low = parameters.index_threshold * parameters.index_grow_share
+        self._grow_share = parameters.index_grow_share
+        self.threshold = parameters.index_threshold
         self.windows = [self._empty_window(hops) for hops in window_hops(parameters)]
         self._none = no_events()
         self._ring: deque[HopEvents] = deque([self._none] * self.windows[-1].hops, maxlen=self.windows[-1].hops)
@@ -122,6 +124,19 @@ class IndexImages:
     def hop_events(self, window: Window) -> Sequence[HopEvents]:
         """Return the hops in ``window``, oldest first."""
         return list(self._ring)[-window.hops :]
+
+    @property
+    def _low(self) -> float:
+        """The lower threshold."""
+        return self.threshold * self._grow_share
+
+    def set_threshold(self, threshold: float) -> None:
+        """Go on with another threshold: the pixels above the lower one are found again."""
+        if threshold == self.threshold:
+            return
+        self.threshold = threshold
+        for window in self.windows:
+            _find_again(self._low, self._offset, window.planes, window.used, window.low)
 
     def push(self, events: HopEvents) -> None:
         """Move every window on by one hop that held ``events``."""
@@ -234,7 +249,7 @@ def _slide(  # type: ignore[no-untyped-def]
     gone_rows, gone_first, gone, came_rows, came_first, came, low, offset, planes, used, low_bits
 ):
     """Take the counts that leave off and add those that come, row by row; find the low pixels of these rows again."""
-    fewest = np.int64(min(max(1.0, np.ceil(low * offset)), float(_MOST_EVENTS)))
+    fewest = _fewest(low, offset)
     height, words, flat = planes.shape[1], planes.shape[4], planes.reshape(-1)
     carry, many, changed = np.empty(2 * words, np.uint64), np.empty(words, np.uint64), np.empty(2 * words, np.uint64)
     counts, is_low = np.empty((2, _WORD), np.int64), np.empty(_WORD, np.uint64)
@@ -258,19 +273,44 @@ def _slide(  # type: ignore[no-untyped-def]
             low_bits[y, word] &= ~pixels
             many[word] &= pixels
             some |= many[word]
-        if not some:
+        if some:
+            _find_low_row(y, many, low, offset, planes, used, low_bits, counts, is_low)
+
+
+@njit(cache=True, nogil=True)
+def _find_again(low, offset, planes, used, low_bits):  # type: ignore[no-untyped-def]
+    """Find all low pixels again: the threshold has changed."""
+    fewest = _fewest(low, offset)
+    height, words, flat = planes.shape[1], planes.shape[4], planes.reshape(-1)
+    carry, many = np.empty(2 * words, np.uint64), np.empty(words, np.uint64)
+    counts, is_low = np.empty((2, _WORD), np.int64), np.empty(_WORD, np.uint64)
+    for y in range(height):
+        low_bits[y] = _NONE
+        if used[y]:
+            _find_many(flat, y, height, used[y], fewest, many, carry)
+            _find_low_row(y, many, low, offset, planes, used, low_bits, counts, is_low)
+
+
+@njit(cache=True, nogil=True)
+def _fewest(low, offset):  # type: ignore[no-untyped-def]
+    """Return how many events a low pixel has at least."""
+    return np.int64(min(max(1.0, np.ceil(low * offset)), float(_MOST_EVENTS)))
+
+
+@njit(cache=True, nogil=True)
+def _find_low_row(y, many, low, offset, planes, used, low_bits, counts, is_low):  # type: ignore[no-untyped-def]
+    """Find the low ones among those pixels of a row that have events enough; the last two arrays are worked in."""
+    for word in range(len(many)):
+        pixels = many[word]
+        if pixels and _count_bits(pixels) > _FEW_PIXELS:  # all 64 at once
+            _unpack(planes[:, y, :, :, word], used[y], counts)
+            low_bits[y, word] = _find_low(counts, low, offset, is_low)
             continue
-        for word in range(words):
-            pixels = many[word]
-            if pixels and _count_bits(pixels) > _FEW_PIXELS:  # all 64 at once
-                _unpack(planes[:, y, :, :, word], used[y], counts)
-                low_bits[y, word] = _find_low(counts, low, offset, is_low)
-                continue
-            while pixels:
-                place = lowest_bit(pixels)
-                off, on = pixel_counts(planes, used, y, (word << WORD_SHIFT) + place)
-                low_bits[y, word] |= np.uint64(off + on >= low * (offset + abs(on - off))) << np.uint64(place)
-                pixels &= pixels - np.uint64(1)
+        while pixels:
+            place = lowest_bit(pixels)
+            off, on = pixel_counts(planes, used, y, (word << WORD_SHIFT) + place)
+            low_bits[y, word] |= np.uint64(off + on >= low * (offset + abs(on - off))) << np.uint64(place)
+            pixels &= pixels - np.uint64(1)
 
 
 @njit(cache=True, nogil=True)

@@ -225,7 +225,6 @@ class MotionTracker(Tracker):
         self._merge_unread_ns = round(min(_MERGE_UNREAD_S, parameters.merge_after_s) * NS_PER_S)
         self._remembered: dict[int, MotionTrack] = {}
         self._disowned: list[int] = []
-        self._least_index = parameters.index_threshold * parameters.index_grow_share
 
     def update(self, blobs: Sequence[Blob], t_hop_ns: int) -> TrackChanges:
         """Associate the blobs of the hop that ends at ``t_hop_ns`` (ns)."""
@@ -239,7 +238,8 @@ class MotionTracker(Tracker):
         for i, track in enumerate(tracks):
             track.row[SHORT_ON : LONG_OFF + 1] = rows[i, SHORT_ON : LONG_OFF + 1]
             own, index, spread = evidence[i]
-            seen = own >= max(_FEWEST_EVENTS, _SEEN_SHARE * float(rows[i, USUAL]) * hop_s) and index >= self._least_index
+            least_index = self._index_threshold(track) * self._parameters.index_grow_share
+            seen = own >= max(_FEWEST_EVENTS, _SEEN_SHARE * float(rows[i, USUAL]) * hop_s) and index >= least_index
             if blob_of[i] >= 0 or seen:
                 blob = blobs[blob_of[i]] if blob_of[i] >= 0 else None
                 self._see(track, blob, t_hop_ns, own, index, spread, seen)
@@ -255,6 +255,10 @@ class MotionTracker(Tracker):
         self._remember(lost, t_hop_ns)
         left = self._return(tracks, blobs, self._unfollowed(tracks, blobs, track_of, t_hop_ns), t_hop_ns)
         return self._rename(self._begin(left, blobs, lost, t_hop_ns))
+
+    def _index_threshold(self, track: MotionTrack) -> float:
+        """Return the threshold for a track: what sends at a known bit rate is no clutter."""
+        return self.threshold if track.known_bps is None else self._parameters.index_threshold
 
     def clear(self, sensor_size: tuple[int, int]) -> TrackChanges:
         """Lose every track and go on with a sensor size; labels go on."""

@@ -104,6 +104,8 @@ class Detection(Protocol):
     @property
     def tracks(self) -> Mapping[int, Track]: ...
     @property
+    def index_threshold(self) -> float: ...
+    @property
     def idle(self) -> bool: ...
     def route(self, segment: EventBatch) -> RoutedEvents: ...
     def hop(self, t_hop_ns: int) -> TrackChanges: ...
@@ -221,6 +223,11 @@ class Receiver:
     def track_ids(self) -> Collection[int]:
         """Labels of all tracks, and of the lost ones that characters may still come from."""
         return {*self._detection.tracks, *self._slots.looked_back_at}
+
+    @property
+    def index_threshold(self) -> float:
+        """What the index of a blob must reach now."""
+        return self._detection.index_threshold
 
     @property
     def passed_over(self) -> int:

@@ -39,6 +39,11 @@ class WholeSignal:
         return self._tracks
 
     @property
+    def index_threshold(self) -> float:
+        """0: there is no image."""
+        return 0.0
+
+    @property
     def idle(self) -> bool:
         """Whether nothing can change at coming hops without events."""
         return not self._tracks and self._newest_ns is None

@@ -4,6 +4,7 @@
                                                            ├──► no blob:   quiet, position predicted, then lost
                                                            └──► no track:  a new one, strongest blob first
 
+In clutter (:mod:`.clutter`) a hop begins no more than so many tracks, and one whose bit rate nobody knows yet is lost sooner.
 Where ``max_tracks`` are kept, tracks make room for further blobs: first those that are quiet, the longest unseen first, then
 those that have had a turn in vain, the last one first, since its next turn is farthest away.  A track with a demodulator
 never does, nor one in sight that waits for its first turn.  Where a track was that had its turn, a blob has no first turn
@@ -42,6 +43,7 @@ FLOOR_PX = 0.05  # an observation is never better than this
 SURPRISE = 16.0  # an innovation of more than 4 standard deviations is a manoeuvre
 _SAME_RATE = 0.02  # the same beacon's bit rates differ by less
 _NEVER = -(1 << 63)
+_CLUTTER_AFTER_NS = 100_000_000  # what nobody has read is lost so soon where there is clutter
 Covariance = tuple[tuple[float, float], tuple[float, float]]
 """((xx, xy), (xy, yy))."""
 EXTENT_RISE, EXTENT_FALL = 0.5, 0.05  # an extent grows at once and shrinks slowly
@@ -173,7 +175,7 @@ class TrackChanges:
         new: tracks that began.
         lost: tracks that ended, unseen for too long, merged or in favour of others, as they were.
         new_blobs: for each new track, which of the hop's blobs it began with.
-        waiting: blobs that got no track because ``max_tracks`` are kept.
+        waiting: blobs that got no track because ``max_tracks`` are kept, or too many began.
         renamed: new tracks that go on with another's events under a label of their own: that one's label, their own.
     """
 
@@ -190,6 +192,10 @@ class Tracker:
     Args:
         parameters: those under "Tracks".
         sensor_size: width and height (px); a prediction ends at the sensor's border.
+
+    Attributes:
+        threshold: the index threshold now.
+        most_new: so many tracks may begin at the next hop.
     """
 
     def __init__(self, parameters: Parameters, sensor_size: tuple[int, int]) -> None:
@@ -199,6 +205,8 @@ class Tracker:
         self._merge_after_ns = round(parameters.merge_after_s * NS_PER_S)
         self._tracks: dict[int, Track] = {}
         self._next_id = 1
+        self.threshold = parameters.index_threshold
+        self.most_new = parameters.max_tracks
         # Where tracks made room that had had a turn: x, y, radius (px), and when (ns) that ended.
         self._tried_places: deque[tuple[float, float, float, int]] = deque(maxlen=parameters.max_tracks)
 
@@ -231,10 +239,11 @@ class Tracker:
         self, left: list[tuple[int, int]], blobs: Sequence[Blob], lost: tuple[Track, ...], t_hop_ns: int
     ) -> TrackChanges:
         """Begin tracks with the blobs that are left, as far as there is room."""
+        waiting, left = max(0, len(left) - self.most_new), left[: self.most_new]
         evicted = self._make_room(left)
         room = max(0, self._parameters.max_tracks - len(self._tracks))
         new = tuple(self._new_track(blobs[j], t_hop_ns, tried_ns) for tried_ns, j in left[:room])
-        return TrackChanges(new, lost + evicted, tuple(j for _, j in left[:room]), len(left) - len(new))
+        return TrackChanges(new, lost + evicted, tuple(j for _, j in left[:room]), waiting + len(left) - len(new))
 
     def exchange(self, track_id: int, other_id: int) -> None:
         """Let two tracks go on where the other one is."""
@@ -299,10 +308,17 @@ class Tracker:
             track.stop(*kept, t_hop_ns)
 
     def _ended(self, track: Track, t_hop_ns: int) -> bool:
-        if track.quiet and t_hop_ns - track.last_seen_ns >= self._lost_after_ns:
+        lost_after_ns = self._lost_after_ns
+        if self._may_be_clutter(track):
+            lost_after_ns = min(_CLUTTER_AFTER_NS, lost_after_ns)
+        if track.quiet and t_hop_ns - track.last_seen_ns >= lost_after_ns:
             return True
         since = track.covered_since_ns
         return since is not None and t_hop_ns - since >= self._merge_after_ns
+
+    def _may_be_clutter(self, track: Track) -> bool:
+        """Return whether there is clutter, and nothing says that a track is not of it."""
+        return self.threshold > self._parameters.index_threshold and track.known_bps is None
 
     def _unfollowed(
         self,

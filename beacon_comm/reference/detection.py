@@ -117,6 +117,7 @@ class ReferenceImages:
 
     def __init__(self, parameters: Parameters, sensor_size: tuple[int, int]) -> None:
         self._size = sensor_size
+        self.threshold = parameters.index_threshold
         nothing = np.zeros((2, *sensor_size[::-1]), np.int64)
         self.windows = [ReferenceWindow(hops, nothing) for hops in window_hops(parameters)]
         self._ring = deque([_joined([])] * self.windows[-1].hops, maxlen=self.windows[-1].hops)
@@ -145,6 +146,10 @@ class ReferenceImages:
             place = (seen.on * height + seen.y) * width + seen.x
             window.counts = np.bincount(place, minlength=2 * height * width).reshape(2, height, width)
 
+    def set_threshold(self, threshold: float) -> None:
+        """Go on with another threshold."""
+        self.threshold = threshold
+
     def take_off(self) -> bool:
         """Do nothing ahead of time, and say so."""
         return False
@@ -159,11 +164,11 @@ class ReferenceComponents:
     index: NDArray[np.float64]
 
 
-def find_components(counts: NDArray[np.int64], parameters: Parameters) -> ReferenceComponents:
+def find_components(counts: NDArray[np.int64], threshold: float, parameters: Parameters) -> ReferenceComponents:
     """Return the components of an image of counts; see :mod:`beacon_comm.core.components`."""
     off, on = counts
     n, base = off + on, parameters.index_offset + np.abs(on - off)
-    low = (n > 0) & (n >= parameters.index_threshold * parameters.index_grow_share * base)
+    low = (n > 0) & (n >= threshold * parameters.index_grow_share * base)
     closed = _closed(low, parameters.closing_px)
     _, label = cv2.connectedComponents(closed.astype(np.uint8), connectivity=8)
     numbers, met_at = np.unique(label, return_index=True)
@@ -177,7 +182,7 @@ def find_components(counts: NDArray[np.int64], parameters: Parameters) -> Refere
     for k, (extreme, values) in enumerate(((np.minimum, x), (np.maximum, x), (np.minimum, y), (np.maximum, y))):
         box[:, k] = max(label.shape) if extreme is np.minimum else 0
         extreme.at(box[:, k], c, values)
-    weights = (np.ones_like(n), n >= parameters.index_threshold * base, n, n * x, n * y, n * (x * x + y * y))
+    weights = (np.ones_like(n), n >= threshold * base, n, n * x, n * y, n * (x * x + y * y))
     sums = [np.bincount(c, weight, m).astype(np.int64) for weight in weights]
     index = np.bincount(c, n / base, m) / sums[AREA]
     return ReferenceComponents(label, np.column_stack((*sums, box)), index)
@@ -217,7 +222,7 @@ class ReferenceBlobFinder(BlobFinder):
         self.owner = np.zeros_like(self.owner)
         if images.empty:
             return []
-        sets = [find_components(window.counts, p) for window in images.windows]
+        sets = [find_components(window.counts, images.threshold, p) for window in images.windows]
         stands = [
             (s.sums[:, SEEDS] > 0) & (s.sums[:, AREA] >= p.min_area_px) & (s.sums[:, AREA] <= p.max_area_px)
             for s in sets

@@ -363,7 +363,7 @@ class BeaconNode(Node):
             shed=traffic.shed,
             problems=traffic.problem_text(),
             tracks=self._live.beacons(),
-            index_threshold=self._core.index_threshold,
+            index_threshold=self._live.index_threshold,
         )
         silence = why_silent(situation)
         if silence is not None and silence.cause is Cause.OVERLOADED:

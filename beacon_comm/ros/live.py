@@ -116,6 +116,11 @@ class LiveReceiver:
         return self._camera is not None and not self.camera_problem
 
     @property
+    def index_threshold(self) -> float:
+        """What the index of a blob must reach now; clutter raises it."""
+        return self._parameters.index_threshold if self._receiver is None else self._receiver.index_threshold
+
+    @property
     def slots_full(self) -> bool:
         """Whether candidates wait because every slot is taken."""
         return self._receiver is not None and self._receiver.slots_full

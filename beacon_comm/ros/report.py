@@ -92,6 +92,7 @@ class Report:
             **self.latency.look(),
             'tracks': len(tracks),
             **{f'tracks_{state}': count for state, count in sorted(states.items())},
+            'index_threshold': f'{live.index_threshold:.3g}',
             'slots_full': live.slots_full,
             'confirmed': ' '.join(map(str, live.confirmed)),
             **dict(sorted({**self.totals, **counts}.items())),

@@ -57,7 +57,7 @@ class Situation:
         messages, events, bad_messages, shed: counted since the last look.
         problems: kinds of bad messages and how often.
         tracks: all tracks now.
-        index_threshold: of the parameters.
+        index_threshold: what the index of a blob must reach now.
     """
 
     topic: str

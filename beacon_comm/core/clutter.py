@@ -1,0 +1,54 @@
+"""Clutter: the index threshold that keeps the rate of new tracks bounded (a detector of constant false-alarm rate).
+
+    new tracks of a hop ──► level, which leaks at new_tracks_per_s ──► index_threshold × 2^(what is beyond the allowance / 16)
+
+A camera that moves over texture, or that sees enough events for every pixel to have some of both polarities, has hundreds of
+blobs a hop at a threshold that is right for a quiet view: every one costs, and beacons wait behind them for their turn.  A
+beacon among them that is to be read is far above them.  So every new track beyond an allowance raises the threshold, and it
+falls again by itself: in the long run there are no more new tracks than the level leaks, whatever the view is.  As long as
+there are no more than ``new_tracks_burst`` at once, and no more than the leak later, the threshold is ``index_threshold``.
+"""
+
+from __future__ import annotations
+
+import math
+
+from beacon_comm.core.events import NS_PER_S
+from beacon_comm.core.parameters import Parameters
+
+DOUBLING = 16  # so many new tracks beyond the allowance double the threshold …
+STEPS = 4  # … in so many steps …
+MOST_DOUBLINGS = 5  # … and so often at most
+
+
+class Clutter:
+    """Sets the index threshold by the tracks that begin.
+
+    Args:
+        parameters: ``index_threshold``, ``new_tracks_burst``, ``new_tracks_per_s``.
+
+    Attributes:
+        threshold: what the index of a blob must reach now.
+    """
+
+    def __init__(self, parameters: Parameters) -> None:
+        self._least = parameters.index_threshold
+        self._allowed = parameters.new_tracks_burst
+        self._leak_per_ns = parameters.new_tracks_per_s / NS_PER_S
+        self._level = 0.0
+        self._t_ns = 0
+        self.threshold = self._least
+
+    @property
+    def most_new(self) -> int:
+        """How many tracks may begin at the next hop: what is left of the allowance, and as many as double the threshold."""
+        return max(0, math.ceil(self._allowed - self._level)) + DOUBLING
+
+    def count(self, new_tracks: int, t_hop_ns: int) -> None:
+        """Hear of the tracks that began at the hop that ends at ``t_hop_ns`` (ns)."""
+        leaked = self._leak_per_ns * max(0, t_hop_ns - self._t_ns)
+        most = self._allowed + DOUBLING * MOST_DOUBLINGS
+        self._level = min(max(0.0, self._level - leaked) + new_tracks, most)
+        self._t_ns = t_hop_ns
+        steps = math.floor(max(0.0, self._level - self._allowed) * STEPS / DOUBLING)
+        self.threshold = self._least * 2.0 ** (steps / STEPS)
