@@ -1,6 +1,6 @@
 """Clutter: the index threshold that keeps the rate of new tracks bounded (a detector of constant false-alarm rate).
 
-    new tracks of a hop ──► level, which leaks at new_tracks_per_s ──► index_threshold × 2^(what is beyond the allowance / 16)
+    new tracks of a hop ──► level, which leaks at new_tracks_per_s ──► index_threshold × 2^(what is beyond the allowance / 4)
 
 A camera that moves over texture, or that sees enough events for every pixel to have some of both polarities, has hundreds of
 blobs a hop at a threshold that is right for a quiet view: every one costs, and beacons wait behind them for their turn.  A
@@ -16,8 +16,7 @@ import math
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.parameters import Parameters
 
-DOUBLING = 16  # so many new tracks beyond the allowance double the threshold …
-STEPS = 4  # … in so many steps …
+DOUBLING = 4  # so many new tracks beyond the allowance double the threshold …
 MOST_DOUBLINGS = 5  # … and so often at most
 
 
@@ -50,5 +49,5 @@ class Clutter:
         most = self._allowed + DOUBLING * MOST_DOUBLINGS
         self._level = min(max(0.0, self._level - leaked) + new_tracks, most)
         self._t_ns = t_hop_ns
-        steps = math.floor(max(0.0, self._level - self._allowed) * STEPS / DOUBLING)
-        self.threshold = self._least * 2.0 ** (steps / STEPS)
+        beyond = math.floor(max(0.0, self._level - self._allowed))
+        self.threshold = self._least * 2.0 ** (beyond / DOUBLING)

@@ -199,7 +199,7 @@ class Parameters(Declared):
     new_tracks_burst: int = parameter(
         64, 'so many tracks may begin at once; further ones are clutter and raise index_threshold …', '', 1, 1_000_000
     )
-    new_tracks_per_s: float = parameter(10.0, '… for a while, so that in the long run no more than this begin', '1/s', 0.1)
+    new_tracks_per_s: float = parameter(2.0, '… for a while, so that in the long run no more than this begin', '1/s', 0.1)
     closing_px: int = parameter(3, 'side of the square of the morphological closing', 'px', 1, 31)
     min_area_px: int = parameter(3, 'smallest blob', 'px', 1)
     max_area_px: int = parameter(10_000, 'largest blob', 'px', 1)
