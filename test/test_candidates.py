@@ -145,6 +145,14 @@ def test_slots_are_not_full_when_nobody_waits() -> None:
     assert not world.slots.slots_full
 
 
+def test_a_tentative_track_has_no_turn_yet_and_nobody_waits() -> None:
+    world = World(parameters(2), {1: 1, 2: 1}, index={1: 2.0, 2: 1.0})
+    world.tracks[1] = Track(1, 0, 0, T0_NS, 3, 2.0, T0_NS, T0_NS, tentative=True)
+    assert world.run(1).given == [2] and not world.slots.slots_full
+    world.tracks[1].tentative = False
+    assert world.run(1).given == [2, 1]
+
+
 def test_a_beacon_is_confirmed_and_keeps_its_slot() -> None:
     world = World(parameters(2), {1: 1}).run(16)
     assert world.states() == {1: CONFIRMED}

@@ -126,3 +126,31 @@ def test_the_receiver_says_what_the_threshold_is():
     receiver = Receiver(ALLOWED, SIZE)
     receiver.push(grain(0.5))
     assert receiver.index_threshold > 0.6
+
+
+def test_in_clutter_a_track_is_tentative_until_it_has_been_seen_for_a_while():
+    events = merged(grain(1.0), disc(80.0, 60.0, radius_px=5.0, start_s=0.5, duration_s=0.5, rate_per_s=400_000))
+    detector = Detector(ALLOWED, SIZE)
+    ages_ns: dict[bool, list[int]] = {True: [], False: []}
+    raised = [False]  # hop by hop: what a hop begins is told of the clutter at the next one
+
+    def look(_, __):
+        if raised[-1]:
+            for track in detector.tracks.values():
+                ages_ns[track.tentative].append(track.last_seen_ns - track.first_seen_ns)
+        raised.append(detector.index_threshold > ALLOWED.index_threshold)
+
+    detect(detector, events, look)
+    assert max(ages_ns[True]) < 100_000_000 <= min(ages_ns[False])
+    still = [track for track in detector.tracks.values() if abs(track.x_px - 80.0) < 1.0 and abs(track.y_px - 60.0) < 1.0]
+    assert len(still) == 1 and not still[0].tentative
+
+
+def test_nothing_is_tentative_where_there_is_no_clutter():
+    detector = Detector(ALLOWED, SIZE)
+    detect(detector, disc(80.0, 60.0, duration_s=0.2), lambda *_: assert_no_track_is_tentative(detector))
+    assert detector.tracks
+
+
+def assert_no_track_is_tentative(detector: Detector) -> None:
+    assert not any(track.tentative for track in detector.tracks.values())

@@ -354,7 +354,7 @@ class CandidateSlots:
             return (0, -track.index, track_id) if ended_ns is None else (1, ended_ns, track_id)
 
         return sorted(
-            (track_id for track_id, track in tracks.items() if track_id not in self._slots and not track.quiet),
+            (track_id for track_id, track in tracks.items() if track_id not in self._slots and not track.quiet and not track.tentative),
             key=place,
         )
 

@@ -43,7 +43,7 @@ FLOOR_PX = 0.05  # an observation is never better than this
 SURPRISE = 16.0  # an innovation of more than 4 standard deviations is a manoeuvre
 _SAME_RATE = 0.02  # the same beacon's bit rates differ by less
 _NEVER = -(1 << 63)
-_CLUTTER_AFTER_NS = 100_000_000  # what nobody has read is lost so soon where there is clutter
+_CLUTTER_NS = 100_000_000  # where there is clutter, what is seen for less long has no turn, and what is unseen for so long is lost
 Covariance = tuple[tuple[float, float], tuple[float, float]]
 """((xx, xy), (xy, yy))."""
 EXTENT_RISE, EXTENT_FALL = 0.5, 0.05  # an extent grows at once and shrinks slowly
@@ -64,6 +64,7 @@ class Track:
         quiet: no blob at the last hop; the position is predicted.
         matched_ns: the last hop (ns) that had a blob of it.
         held: a demodulator listens to it.
+        tentative: it began in clutter, and has not been seen for long: no demodulator is to listen to it yet.
         tried_ns: when (ns) its last turn at a demodulator ended, or that of the track that made room there; None: there was
             none, or it has it now.
         covered_since_ns: since when (ns) an older track has had the blob it lies in, None: it lies in none.
@@ -92,6 +93,7 @@ class Track:
     quiet: bool = False
     matched_ns: int = 0
     held: bool = False
+    tentative: bool = False
     tried_ns: int | None = None
     covered_since_ns: int | None = None
     bit_rate_bps: float | None = None
@@ -242,7 +244,11 @@ class Tracker:
         waiting, left = max(0, len(left) - self.most_new), left[: self.most_new]
         evicted = self._make_room(left)
         room = max(0, self._parameters.max_tracks - len(self._tracks))
+        for track in self._tracks.values():
+            track.tentative = self._may_be_clutter(track) and track.last_seen_ns - track.first_seen_ns < _CLUTTER_NS
         new = tuple(self._new_track(blobs[j], t_hop_ns, tried_ns) for tried_ns, j in left[:room])
+        for track in new:
+            track.tentative = self._may_be_clutter(track)
         return TrackChanges(new, lost + evicted, tuple(j for _, j in left[:room]), waiting + len(left) - len(new))
 
     def exchange(self, track_id: int, other_id: int) -> None:
@@ -310,7 +316,7 @@ class Tracker:
     def _ended(self, track: Track, t_hop_ns: int) -> bool:
         lost_after_ns = self._lost_after_ns
         if self._may_be_clutter(track):
-            lost_after_ns = min(_CLUTTER_AFTER_NS, lost_after_ns)
+            lost_after_ns = min(_CLUTTER_NS, lost_after_ns)
         if track.quiet and t_hop_ns - track.last_seen_ns >= lost_after_ns:
             return True
         since = track.covered_since_ns
