@@ -18,6 +18,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import numba
@@ -27,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))  # PYTHONSAFEPATH leave
 
 from live import Phase, can_publish_arrays, measure  # noqa: E402
 from measuring import ChainRun, MetricTable, best_s, mev_per_s, module_ns, run_chain  # noqa: E402
-from streams import DENSE, Stream, make_stream, messages, real_words  # noqa: E402
+from streams import LOOP_NS, PACKET_NS, WORDS_BAG, Repeated, Stream, make_stream, messages, own_rate, real_words  # noqa: E402
 
 from beacon_comm.compiling.warm_up import warm_up  # noqa: E402
 from beacon_comm.core.detection import Detector  # noqa: E402
@@ -125,38 +126,58 @@ def decode_by_pypi(payloads: Sequence[bytes]) -> float | None:
 
 
 CHAIN = (
-    # key, sensor, background (events/s), index_threshold
-    ('', HD, 20e6, DENSE),
-    ('vga_', VGA, 8e6, DENSE),
-    ('vga_20mev_', VGA, 20e6, 5.0),  # 65 events a second and pixel
-    ('40mev_', HD, 40e6, DENSE),
-    ('default_threshold_', HD, 7e6, 0.6),
-    ('sparse_vga_', VGA, 1e6, 0.6),
+    # key, sensor, background (events/s)
+    ('', HD, 20e6),
+    ('40mev_', HD, 40e6),
+    ('7mev_', HD, 7e6),
+    ('vga_20mev_', VGA, 20e6),
+    ('vga_', VGA, 8e6),
+    ('sparse_vga_', VGA, 1e6),
+    ('real_vga_', VGA, None),  # the bag of real words, at its own pace and in its own packets
 )
+CHAIN_ROUNDS, REAL_PACKET_NS = 4, 4_000_000
+LOOP_S = LOOP_NS / 1e9
 
 
 def chain(folder: Path) -> MetricTable:
     """Measure bytes to characters, window and morphology included, and the share of each part."""
     metrics: MetricTable = {}
     head(
-        'From evt3 bytes to characters, two beacons', 'sensor', 'background Mev/s', 'index_threshold', 'receiver', 'Mev/s',
-        'of real time', 'decoding ns', 'detection ns', 'demodulation ns an event', 'tracks', 'confirmed', 'characters',
+        'From evt3 bytes to characters, two beacons', 'sensor', 'Mev/s of the stream', 'receiver', 'Mev/s',
+        'of real time', 'decoding ns', 'detection ns', 'demodulation ns an event', 'index_threshold', 'tracks', 'confirmed',
+        'characters',
     )  # fmt: skip
-    for key, size, rate, threshold in CHAIN:
-        stream = make_stream(folder, size, rate, 25e6 / max(rate, 10e6))
-        cdrs = list(messages(stream, 'evt3'))
+    for key, size, rate in CHAIN:
+        stream, cdrs = chain_messages(folder, size, rate)
         for receiver in ('threshold', 'sequence'):
-            parameters = Parameters(receiver=receiver, index_threshold=threshold)
+            parameters = Parameters(receiver=receiver)
             run = best_chain(cdrs, size, parameters)
             name = f'{key}evt3_to_characters' + ('' if receiver == 'threshold' else '_sequence')
             metrics[f'{name}_mev_per_s'] = mev_per_s(run.events, run.total_s)
-            print_chain(stream, rate, threshold, receiver, run)
+            print_chain(stream, receiver, run)
         if not key:
-            by_numpy = numpy_mev_per_s(cdrs[:60], size, parameters)
+            settled = replace(parameters, index_threshold=run.index_threshold)
+            by_numpy = numpy_mev_per_s(cdrs[:60], size, settled)
             metrics['numpy_reference_mev_per_s'] = by_numpy
             metrics['evt3_to_characters_over_numpy_ratio'] = metrics['evt3_to_characters_mev_per_s'] / by_numpy
-            row('all in plain numpy', '', '', 'threshold', by_numpy, *[''] * 7)
+            row('all in plain numpy', '', 'threshold', by_numpy, *[''] * 8)
     return metrics
+
+
+def chain_messages(folder: Path, size: tuple[int, int], events_per_s: float | None) -> tuple[Stream, list[bytes]]:
+    """Return a stream with two beacons, and its messages for :data:`CHAIN_ROUNDS` rounds; None: the bag of real words."""
+    if events_per_s is None:
+        rate, packet_ns, bag = own_rate(folder, WORDS_BAG), REAL_PACKET_NS, WORDS_BAG
+        stream = make_stream(folder, size, rate, LOOP_S, packet_ns=packet_ns, repeatable=True, bag=bag)
+    else:
+        packet_ns = PACKET_NS
+        stream = make_stream(folder, size, events_per_s, LOOP_S, repeatable=True)
+    return stream, rounds(stream, CHAIN_ROUNDS, packet_ns)
+
+
+def rounds(stream: Stream, count: int, packet_ns: int = PACKET_NS) -> list[bytes]:
+    """Return a repeatable stream's messages, so many rounds of them."""
+    return list(islice(Repeated(stream, 'evt3', packet_ns), count * len(stream.batches)))
 
 
 def numpy_mev_per_s(cdrs: Sequence[bytes], size: tuple[int, int], parameters: Parameters) -> float:
@@ -177,25 +198,26 @@ def numpy_decode_s(cdrs: Sequence[bytes], size: tuple[int, int]) -> float:
     return best_s(decode, 1)
 
 
-def best_chain(cdrs: Sequence[bytes], size: tuple[int, int], parameters: Parameters, repeats: int = 2) -> ChainRun:
-    """Return the quickest of several runs."""
-    return min((run_chain(cdrs, size, parameters, Detector) for _ in range(repeats)), key=lambda run: run.total_s)
+def best_chain(cdrs: Sequence[bytes], size: tuple[int, int], parameters: Parameters, timed_from: int = 0) -> ChainRun:
+    """Return the quickest of two runs."""
+    return min((run_chain(cdrs, size, parameters, Detector, timed_from) for _ in range(2)), key=lambda run: run.total_s)
 
 
-def print_chain(stream: Stream, rate: float, threshold: float, receiver: str, run: ChainRun) -> None:
+def print_chain(stream: Stream, receiver: str, run: ChainRun) -> None:
     """Print a run's line."""
     ns = [seconds / run.events * 1e9 for seconds in (run.decode_s, run.detect_s, run.demodulate_s)]
     row(
-        f'{stream.width} x {stream.height}', rate / 1e6, threshold, receiver, mev_per_s(run.events, run.total_s),
-        f'{stream.seconds / run.total_s:.2f} x', *ns, run.tracks, run.confirmed, run.characters,
+        f'{stream.width} x {stream.height}', stream.events / stream.seconds / 1e6, receiver, mev_per_s(run.events, run.total_s),
+        f'{CHAIN_ROUNDS * stream.seconds / run.total_s:.2f} x', *ns, run.index_threshold, run.tracks, run.confirmed,
+        run.characters,
     )  # fmt: skip
 
 
 def stages(folder: Path) -> MetricTable:
     """Print in which modules the time goes, by the profiler, whose own cost is in the calls."""
-    for size, rate, threshold in ((HD, 20e6, DENSE), (VGA, 1e6, 0.6)):
-        cdrs = list(messages(make_stream(folder, size, rate, 0.5), 'evt3'))
-        parameters = Parameters(receiver='threshold', index_threshold=threshold)
+    for size, rate in ((HD, 20e6), (VGA, 1e6)):
+        cdrs = rounds(make_stream(folder, size, rate, LOOP_S, repeatable=True), 2)
+        parameters = Parameters(receiver='threshold')
         table = module_ns(lambda c=cdrs, s=size, p=parameters: run_chain(c, s, p, Detector))  # type: ignore[misc]
         total = sum(table.values())
         head(f'Where the time goes: {size[0]} x {size[1]}, {rate / 1e6:g} Mev/s', 'module', 'ns an event', 'share')
@@ -204,32 +226,32 @@ def stages(folder: Path) -> MetricTable:
     return {}
 
 
-HOPS = ((0.0, 0.6, 'two_beacons'), (1e6, 0.6, '1mev'), (10e6, DENSE, '10mev'), (40e6, DENSE, '40mev'))
+HOPS = ((0.0, 'two_beacons'), (1e6, '1mev'), (10e6, '10mev'), (40e6, '40mev'))
 
 
 def hops(folder: Path) -> MetricTable:
     """Measure what a hop costs beside its events' decoding and routing: windows, threshold, morphology, components."""
     metrics: MetricTable = {}
     title = 'A hop: windows, threshold, morphology, components, tracks'
-    head(title, 'sensor', 'background Mev/s', 'index_threshold', 'ms a hop')
+    head(title, 'sensor', 'background Mev/s', 'ms a hop', 'index_threshold')
     for size, name in ((HD, 'hd'), (VGA, 'vga')):
-        for rate, threshold, label in HOPS:
-            stream = make_stream(folder, size, rate, 0.2, packet_ns=10_000_000)
-            parameters = Parameters(index_threshold=threshold)
+        for rate, label in HOPS:
+            stream = make_stream(folder, size, rate, 0.6, packet_ns=10_000_000)
             times = []
             for _ in range(2):
-                detector = Detector(parameters, size)
-                for batch in stream.batches:
+                detector = Detector(Parameters(), size)
+                for k, batch in enumerate(stream.batches):
                     detector.route(batch.slice(0, int(np.searchsorted(batch.t_ns, batch.t_end_ns)), batch.t_end_ns))
                     begun = time.process_time()
                     detector.hop(batch.t_end_ns)
-                    times.append(time.process_time() - begun)
+                    if k >= len(stream.batches) // 2:  # the threshold has settled
+                        times.append(time.process_time() - begun)
             metrics[f'hop_{name}_{label}_ms'] = float(np.median(times) * 1e3)
-            row(f'{size[0]} x {size[1]}', rate / 1e6, threshold, metrics[f'hop_{name}_{label}_ms'])
+            row(f'{size[0]} x {size[1]}', rate / 1e6, metrics[f'hop_{name}_{label}_ms'], detector.index_threshold)
     return metrics
 
 
-SCALING_BEACONS, SCALING_RATES = (2, 16, 64), (1e6, 5e6, 20e6)
+SCALING_BEACONS, SCALING_RATES, SCALING_PACKET_NS = (2, 16, 64), (1e6, 5e6, 20e6), 4_000_000
 
 
 def scaling(folder: Path) -> MetricTable:
@@ -242,10 +264,9 @@ def scaling(folder: Path) -> MetricTable:
     for size, name in ((VGA, 'vga'), (HD, 'hd')):
         for rate in SCALING_RATES:
             for count in SCALING_BEACONS:
-                stream = make_stream(folder, size, rate, 0.4, count, packet_ns=5_000_000)
-                cdrs = list(messages(stream, 'evt3'))
-                parameters = Parameters(receiver='threshold', index_threshold=DENSE, candidate_slots=80)
-                run = best_chain(cdrs, size, parameters)
+                stream = make_stream(folder, size, rate, LOOP_S, count, packet_ns=SCALING_PACKET_NS, repeatable=True)
+                cdrs = rounds(stream, 2, SCALING_PACKET_NS)
+                run = best_chain(cdrs, size, Parameters(receiver='threshold', candidate_slots=80), len(stream.batches))
                 hop_count = stream.seconds * 100
                 key = f'scaling_{name}_{rate / 1e6:g}mev_{count}_beacons'
                 metrics[f'{key}_ns_per_event'] = (run.decode_s + run.detect_s) / run.events * 1e9

@@ -20,7 +20,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -31,12 +31,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))  # PYTHONSAFEPATH leaves it out
 
-from streams import DENSE, LOOP_NS, START_NS, Stream, make_stream, messages  # noqa: E402
+from streams import LOOP_NS, PACKET_NS, Repeated, make_stream  # noqa: E402
 
 from beacon_comm.core.events import NS_PER_S  # noqa: E402
 from beacon_comm.ros.latency import LOOKS  # noqa: E402
-from beacon_comm.wire.cdr import EVENT_STRIDE_BYTES, build_event_packet, parse_event_array, parse_event_packet  # noqa: E402
-from beacon_comm.wire.evt3 import TIME_HIGH  # noqa: E402
 
 PROJECT = Path(__file__).resolve().parents[1]
 PROFILE = PROJECT / 'config' / 'fastdds_shm.xml'
@@ -44,7 +42,6 @@ MESSAGES_PREFIX = Path(sys.prefix) / 'bench'
 """Where ``make bench`` installs dvs_msgs, for its own processes alone."""
 TOPIC = '/bench/events'
 SIZE = (1280, 720)
-PACKET_NS = 1_000_000
 WARM_UP_S, MEASURED_S = 2.0, LOOKS + 1.0
 """The node's window of latencies, which is up to a second old, is to lie in the second part."""
 CONNECTED_S, SETTLED_S, CONNECT_TIMEOUT_S, START_TIMEOUT_S = 0.5, 4.0, 10.0, 240.0
@@ -140,61 +137,12 @@ def environment(folder: Path) -> dict[str, str]:
     return env
 
 
-class Repeated:
-    """A stream's messages round and round: their times go on, and so do the numbers of the packets."""
-
-    def __init__(self, stream: Stream, encoding: str) -> None:
-        self.events = np.array([len(batch) for batch in stream.batches])
-        self._size = (stream.width, stream.height)
-        self._encoding = encoding
-        self._cdrs = [bytearray(cdr) for cdr in messages(stream, encoding)]
-        self._rounds = 0
-        if encoding == 'evt3':
-            self._payloads = [parse_event_packet(cdr).payload.view('<u2') for cdr in self._cdrs]
-            self._highs = [np.flatnonzero(words >> 12 == TIME_HIGH) for words in self._payloads]
-
-    def __iter__(self) -> Iterator[bytes]:
-        while True:
-            for k in range(len(self._cdrs)):
-                yield self._packet(k) if self._encoding == 'evt3' else bytes(self._cdrs[k])
-                self._go_on(k)
-            self._rounds += 1
-
-    def _packet(self, k: int) -> bytes:
-        seq = self._rounds * len(self._cdrs) + k
-        stamp_ns = START_NS + seq * PACKET_NS
-        return build_event_packet(stamp_ns, 'camera', *self._size, seq, 0, 'evt3', self._payloads[k])
-
-    def _go_on(self, k: int) -> None:
-        """Move a message's times on by a round."""
-        if self._encoding == 'evt3':
-            words, at = self._payloads[k], self._highs[k]
-            words[at] = TIME_HIGH << 12 | (words[at] + LOOP_NS // 4_096_000) & 0xFFF
-            return
-        cdr = self._cdrs[k]
-        _go_on(np.frombuffer(cdr, '<u4', 2, 4))
-        events = parse_event_array(cdr)
-        if events.event_count:
-            body = len(cdr) - len(events.payload)
-            _go_on(np.frombuffer(cdr, '<u4', (len(cdr) - body) // 4, body)[1:])
-
-
-def _go_on(words: np.ndarray) -> None:
-    """Move seconds and nanoseconds, which stand in the first two of every four words, on by a round."""
-    every = EVENT_STRIDE_BYTES // 4
-    seconds, nanoseconds = words[0::every], words[1::every]
-    nanoseconds += LOOP_NS % NS_PER_S
-    carry = nanoseconds >= NS_PER_S
-    nanoseconds -= carry * np.uint32(NS_PER_S)
-    seconds += carry + np.uint32(LOOP_NS // NS_PER_S)
-
-
 class Node:
     """The node under measurement, a process of its own."""
 
     def __init__(self, folder: Path) -> None:
         self._log = folder / 'node.log'
-        arguments = ['--ros-args', '-r', f'events:={TOPIC}', '-p', f'index_threshold:={DENSE}']
+        arguments = ['--ros-args', '-r', f'events:={TOPIC}']
         with self._log.open('w') as log:
             self.process = subprocess.Popen(
                 [sys.executable, '-P', '-m', 'beacon_comm.ros.node', *arguments], stdout=log, stderr=subprocess.STDOUT

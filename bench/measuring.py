@@ -37,7 +37,8 @@ class ChainRun:
     """One run from bytes to characters.
 
     Attributes:
-        events, characters, tracks, confirmed: counted at its end.
+        events: that were read while it was timed.
+        characters, tracks, confirmed, index_threshold: at its end.
         total_s: processor time of all of it (s).
         decode_s, detect_s, demodulate_s: the shares of it in wire, in detection, and in the candidate slots, as a steady clock
             has them: asking how much processor time was used would cost more than a stage here and there.
@@ -47,6 +48,7 @@ class ChainRun:
     characters: int
     tracks: int
     confirmed: int
+    index_threshold: float
     total_s: float
     decode_s: float
     detect_s: float
@@ -60,6 +62,11 @@ class TimedDetection:
         self._detection = detection
         self.seconds = 0.0
         self.tracks = detection.tracks
+
+    @property
+    def index_threshold(self) -> float:
+        """See Detection."""
+        return self._detection.index_threshold
 
     @property
     def idle(self) -> bool:
@@ -90,15 +97,19 @@ def run_chain(
     size: tuple[int, int],
     parameters: Parameters,
     make_detection: Callable[[Parameters, tuple[int, int]], Detection],
+    timed_from: int = 0,
 ) -> ChainRun:
-    """Push messages through a reader and a receiver, one after the other."""
+    """Push messages through a reader and a receiver, one after the other; those from ``timed_from`` on are timed."""
     stream = EventStream('event_camera_msgs/msg/EventPacket')
     detection = TimedDetection(make_detection(parameters, size))
     receiver = Receiver(parameters, size, detection=detection)  # type: ignore[arg-type]
     decode_s = 0.0
-    characters = 0
+    characters = before = 0
     begun_s, begun_processor_s = time.perf_counter(), time.process_time()
-    for cdr in messages:
+    for k, cdr in enumerate(messages):
+        if k == timed_from:
+            detection.seconds, decode_s, before = 0.0, 0.0, stream.counts['events']
+            begun_s, begun_processor_s = time.perf_counter(), time.process_time()
         begun = time.perf_counter()
         batch = stream.push(cdr).batch
         decode_s += time.perf_counter() - begun
@@ -108,17 +119,16 @@ def run_chain(
     share = total_s / (time.perf_counter() - begun_s)
     decode_s, detect_s = decode_s * share, detection.seconds * share
     return ChainRun(
-        stream.counts['events'],
+        stream.counts['events'] - before,
         characters,
         len(receiver.beacons()),
         len(receiver.confirmed),
+        receiver.index_threshold,
         total_s,
         decode_s,
         detect_s,
         total_s - decode_s - detect_s,
     )
-
-
 
 
 def module_ns(run: Callable[[], ChainRun]) -> dict[str, float]:

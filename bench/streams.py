@@ -22,13 +22,19 @@ from beacon_comm.core.events import NS_PER_S, EventBatch
 from beacon_comm.recordings.bags import open_recording
 from beacon_comm.recordings.disc import Disc
 from beacon_comm.recordings.mat import read_mat
-from beacon_comm.wire.cdr import build_event_array, build_event_packet, parse_event_packet
+from beacon_comm.wire.cdr import (
+    EVENT_STRIDE_BYTES,
+    build_event_array,
+    build_event_packet,
+    parse_event_array,
+    parse_event_packet,
+)
 from beacon_comm.wire.evt3 import TIME_HIGH
 from beacon_comm.wire.evt3_encoder import Evt3Encoder
 from beacon_comm.wire.stream import EventStream
 
-BAG, BAG_SIZE = 'libcaer_grid', (346, 260)
-WORDS_BAG = 'evt3_static'
+BAG, WORDS_BAG = 'libcaer_grid', 'evt3_static'
+BAG_SIZE = {BAG: (346, 260), WORDS_BAG: (640, 480)}
 RECORDINGS = (('3125hz_30m.mat', 1.0), ('504hz_30m.mat', 12.2))  # and where their text is under way (s)
 LOOP_NS = 1_024_000_000
 """Length of a stream that can be repeated: whole packets, and whole steps of evt3's upper time bits (4096 µs)."""
@@ -37,8 +43,7 @@ LOOP_CHARACTERS = ((291, 3123.8), (47, 503.9))
 BITS = 11
 START_NS = NS_PER_S
 RADIUS_PX = 4.0
-DENSE = 3.0
-"""index_threshold in scenes of so many events that every pixel has some of both polarities in the long window."""
+PACKET_NS = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,17 +83,20 @@ def bag_events(path: Path) -> EventBatch:
     return EventBatch(x, y, polarity, t_ns, batches[-1].t_end_ns)
 
 
-def tiled(once: EventBatch, size: tuple[int, int], events_per_s: float, duration_ns: int) -> EventBatch:
+def tiled(
+    once: EventBatch, bag_size: tuple[int, int], size: tuple[int, int], events_per_s: float, duration_ns: int
+) -> EventBatch:
     """Return the bag's events side by side all over the sensor and over and over, from time 0 on.
 
     Args:
         once: the bag's events.
+        bag_size: width and height of its sensor (px).
         size: width and height of the sensor to fill (px).
         events_per_s: how many there are to be.
         duration_ns: until when (ns).
     """
     width, height = size
-    corners = [(left, top) for left in range(0, width, BAG_SIZE[0]) for top in range(0, height, BAG_SIZE[1])]
+    corners = [(left, top) for left in range(0, width, bag_size[0]) for top in range(0, height, bag_size[1])]
     inside = [(once.x + left < width) & (once.y + top < height) for left, top in corners]
     period_ns = round(sum(int(which.sum()) for which in inside) / events_per_s * NS_PER_S)
     faster = period_ns / (int(once.t_ns[-1] - once.t_ns[0]) + 1000)
@@ -157,14 +165,21 @@ def beacons(
     return placed
 
 
+def own_rate(folder: Path, bag: str) -> float:
+    """Return how many events a second a bag has."""
+    events = bag_events(folder / bag)
+    return len(events) / (int(events.t_ns[-1] - events.t_ns[0]) + 1000) * NS_PER_S
+
+
 def make_stream(
     folder: Path,
     size: tuple[int, int],
     events_per_s: float,
     duration_s: float,
     beacon_count: int = 2,
-    packet_ns: int = 1_000_000,
+    packet_ns: int = PACKET_NS,
     repeatable: bool = False,
+    bag: str = BAG,
 ) -> Stream:
     """Return a background with beacons in it, cut into packets.
 
@@ -176,11 +191,12 @@ def make_stream(
         beacon_count: how many.
         packet_ns: length of a packet (ns).
         repeatable: it can be sent round and round without a break in what the beacons say; only of :data:`LOOP_NS`.
+        bag: of the background.
     """
     duration_ns = round(duration_s * NS_PER_S)
     parts = beacons(folder, size, beacon_count, duration_ns, repeatable)
     if events_per_s:
-        parts.insert(0, tiled(bag_events(folder / BAG), size, events_per_s, duration_ns))
+        parts.insert(0, tiled(bag_events(folder / bag), BAG_SIZE[bag], size, events_per_s, duration_ns))
     t_ns = np.concatenate([part.t_ns for part in parts]) // 1000 * 1000 + START_NS
     order = np.argsort(t_ns, kind='stable')
     t_ns = t_ns[order]
@@ -233,6 +249,56 @@ def _libcaer_cmp(batch: EventBatch, dt_ns: NDArray[np.int64]) -> bytes:
 
 
 _PAYLOADS = {'mono': _mono, 'libcaer': _libcaer, 'libcaer_cmp': _libcaer_cmp}
+
+
+class Repeated:
+    """A stream's messages round and round: their times go on, and so do the numbers of the packets."""
+
+    def __init__(self, stream: Stream, encoding: str, packet_ns: int = PACKET_NS) -> None:
+        self.events = np.array([len(batch) for batch in stream.batches])
+        self._size = (stream.width, stream.height)
+        self._encoding = encoding
+        self._packet_ns = packet_ns
+        self._cdrs = [bytearray(cdr) for cdr in messages(stream, encoding)]
+        self._rounds = 0
+        if encoding == 'evt3':
+            self._payloads = [parse_event_packet(cdr).payload.view('<u2') for cdr in self._cdrs]
+            self._highs = [np.flatnonzero(words >> 12 == TIME_HIGH) for words in self._payloads]
+
+    def __iter__(self) -> Iterator[bytes]:
+        while True:
+            for k in range(len(self._cdrs)):
+                yield self._packet(k) if self._encoding == 'evt3' else bytes(self._cdrs[k])
+                self._go_on(k)
+            self._rounds += 1
+
+    def _packet(self, k: int) -> bytes:
+        seq = self._rounds * len(self._cdrs) + k
+        stamp_ns = START_NS + seq * self._packet_ns
+        return build_event_packet(stamp_ns, 'camera', *self._size, seq, 0, 'evt3', self._payloads[k])
+
+    def _go_on(self, k: int) -> None:
+        """Move a message's times on by a round."""
+        if self._encoding == 'evt3':
+            words, at = self._payloads[k], self._highs[k]
+            words[at] = TIME_HIGH << 12 | (words[at] + LOOP_NS // 4_096_000) & 0xFFF
+            return
+        cdr = self._cdrs[k]
+        _go_on(np.frombuffer(cdr, '<u4', 2, 4))
+        events = parse_event_array(cdr)
+        if events.event_count:
+            body = len(cdr) - len(events.payload)
+            _go_on(np.frombuffer(cdr, '<u4', (len(cdr) - body) // 4, body)[1:])
+
+
+def _go_on(words: np.ndarray) -> None:
+    """Move seconds and nanoseconds, which stand in the first two of every four words, on by a round."""
+    every = EVENT_STRIDE_BYTES // 4
+    seconds, nanoseconds = words[0::every], words[1::every]
+    nanoseconds += LOOP_NS % NS_PER_S
+    carry = nanoseconds >= NS_PER_S
+    nanoseconds -= carry * np.uint32(NS_PER_S)
+    seconds += carry + np.uint32(LOOP_NS // NS_PER_S)
 
 
 def real_words(folder: Path, total_bytes: int, packet_bytes: int | None = None) -> tuple[list[bytes], tuple[int, int]]:

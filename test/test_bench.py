@@ -11,8 +11,8 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'bench'))
 
-from live import Phase, Repeated, measure  # noqa: E402
-from streams import LOOP_NS, START_NS, make_stream, messages  # noqa: E402
+from live import Phase, measure  # noqa: E402
+from streams import LOOP_NS, START_NS, Repeated, make_stream, messages  # noqa: E402
 
 import bench  # noqa: E402
 from beacon_comm.core.parameters import Parameters  # noqa: E402
