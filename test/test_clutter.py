@@ -6,7 +6,7 @@ from disc_events import HOP_NS, T0_NS, batch, detect, disc, gathered, merged, no
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beacon_comm.core.clutter import DOUBLING, MOST_DOUBLINGS, Clutter
+from beacon_comm.core.clutter import CROWD, DOUBLING, MOST_DOUBLINGS, Clutter
 from beacon_comm.core.detection import Detector
 from beacon_comm.core.events import NS_PER_S, EventBatch
 from beacon_comm.core.index_image import IndexImages
@@ -132,13 +132,11 @@ def test_in_clutter_a_track_is_tentative_until_it_has_been_seen_for_a_while():
     events = merged(grain(1.0), disc(80.0, 60.0, radius_px=5.0, start_s=0.5, duration_s=0.5, rate_per_s=400_000))
     detector = Detector(ALLOWED, SIZE)
     ages_ns: dict[bool, list[int]] = {True: [], False: []}
-    raised = [False]  # hop by hop: what a hop begins is told of the clutter at the next one
 
     def look(_, __):
-        if raised[-1]:
+        if detector.index_threshold > ALLOWED.index_threshold:
             for track in detector.tracks.values():
                 ages_ns[track.tentative].append(track.last_seen_ns - track.first_seen_ns)
-        raised.append(detector.index_threshold > ALLOWED.index_threshold)
 
     detect(detector, events, look)
     assert max(ages_ns[True]) < 100_000_000 <= min(ages_ns[False])
@@ -146,11 +144,12 @@ def test_in_clutter_a_track_is_tentative_until_it_has_been_seen_for_a_while():
     assert len(still) == 1 and not still[0].tentative
 
 
-def test_nothing_is_tentative_where_there_is_no_clutter():
-    detector = Detector(ALLOWED, SIZE)
-    detect(detector, disc(80.0, 60.0, duration_s=0.2), lambda *_: assert_no_track_is_tentative(detector))
-    assert detector.tracks
-
-
-def assert_no_track_is_tentative(detector: Detector) -> None:
-    assert not any(track.tentative for track in detector.tracks.values())
+@pytest.mark.parametrize('count', [CROWD, CROWD + 1])
+def test_what_begins_in_a_crowd_is_tentative_and_nothing_else(count):
+    """Before the threshold rises, too: who knows whether more will begin."""
+    lights = [disc(20.0 + 30.0 * (k % 5), 15.0 + 25.0 * (k // 5), duration_s=0.3, seed=k) for k in range(count)]
+    detector = Detector(Parameters(), SIZE)
+    tentative = []
+    detect(detector, merged(*lights), lambda *_: tentative.append([one.tentative for one in detector.tracks.values()]))
+    assert len(detector.tracks) == count and detector.index_threshold == 0.6
+    assert any(map(any, tentative)) == (count > CROWD) and not any(tentative[-1])

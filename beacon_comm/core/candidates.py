@@ -353,10 +353,8 @@ class CandidateSlots:
             ended_ns = track.tried_ns if tried is None else tried.ended_ns
             return (0, -track.index, track_id) if ended_ns is None else (1, ended_ns, track_id)
 
-        return sorted(
-            (track_id for track_id, track in tracks.items() if track_id not in self._slots and not track.quiet and not track.tentative),
-            key=place,
-        )
+        ready = [track_id for track_id, track in tracks.items() if not track.quiet and not track.tentative]
+        return sorted((track_id for track_id in ready if track_id not in self._slots), key=place)
 
     def _end_turns_that_are_over(self, t_ns: int, wanted: int) -> None:
         """Free up to ``wanted`` slots of candidates past ``turn_characters`` or given up, most characters first."""

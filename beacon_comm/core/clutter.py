@@ -18,6 +18,7 @@ from beacon_comm.core.parameters import Parameters
 
 DOUBLING = 4  # so many new tracks beyond the allowance double the threshold …
 MOST_DOUBLINGS = 5  # … and so often at most
+CROWD = 16  # where so many more began than have leaked away, what begins is tentative
 
 
 class Clutter:
@@ -42,6 +43,11 @@ class Clutter:
     def most_new(self) -> int:
         """How many tracks may begin at the next hop: what is left of the allowance, and as many as double the threshold."""
         return max(0, math.ceil(self._allowed - self._level)) + DOUBLING
+
+    @property
+    def crowded(self) -> bool:
+        """Whether many tracks began lately."""
+        return self._level > CROWD
 
     def count(self, new_tracks: int, t_hop_ns: int) -> None:
         """Hear of the tracks that began at the hop that ends at ``t_hop_ns`` (ns)."""

@@ -243,7 +243,7 @@ class Detector:
 
     def _heed_clutter(self) -> None:
         """Let the tracks that began set the threshold of the hops to come."""
-        self._tracker.threshold, self._tracker.most_new = self._clutter.threshold, self._clutter.most_new
+        self._tracker.heed(self._clutter)
         self._images.set_threshold(self._clutter.threshold)
 
     def _exchange(self) -> list[tuple[int, int]]:

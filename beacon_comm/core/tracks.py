@@ -4,7 +4,8 @@
                                                            ├──► no blob:   quiet, position predicted, then lost
                                                            └──► no track:  a new one, strongest blob first
 
-In clutter (:mod:`.clutter`) a hop begins no more than so many tracks, and one whose bit rate nobody knows yet is lost sooner.
+In clutter (:mod:`.clutter`) a hop begins no more than so many tracks, and one whose bit rate nobody knows yet is lost sooner;
+where many begin, none has a turn before it has been seen for 0.1 s.
 Where ``max_tracks`` are kept, tracks make room for further blobs: first those that are quiet, the longest unseen first, then
 those that have had a turn in vain, the last one first, since its next turn is farthest away.  A track with a demodulator
 never does, nor one in sight that waits for its first turn.  Where a track was that had its turn, a blob has no first turn
@@ -31,6 +32,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from beacon_comm.core.blobs import Blob
+from beacon_comm.core.clutter import Clutter
 from beacon_comm.core.events import NS_PER_S
 from beacon_comm.core.parameters import Parameters
 
@@ -43,7 +45,7 @@ FLOOR_PX = 0.05  # an observation is never better than this
 SURPRISE = 16.0  # an innovation of more than 4 standard deviations is a manoeuvre
 _SAME_RATE = 0.02  # the same beacon's bit rates differ by less
 _NEVER = -(1 << 63)
-_CLUTTER_NS = 100_000_000  # where there is clutter, what is seen for less long has no turn, and what is unseen for so long is lost
+_CLUTTER_NS = 100_000_000  # in clutter, what has been seen for less long has no turn, and what is unseen for so long is lost
 Covariance = tuple[tuple[float, float], tuple[float, float]]
 """((xx, xy), (xy, yy))."""
 EXTENT_RISE, EXTENT_FALL = 0.5, 0.05  # an extent grows at once and shrinks slowly
@@ -64,7 +66,7 @@ class Track:
         quiet: no blob at the last hop; the position is predicted.
         matched_ns: the last hop (ns) that had a blob of it.
         held: a demodulator listens to it.
-        tentative: it began in clutter, and has not been seen for long: no demodulator is to listen to it yet.
+        tentative: many began with it, and it has not been seen for long: no demodulator is to listen to it yet.
         tried_ns: when (ns) its last turn at a demodulator ended, or that of the track that made room there; None: there was
             none, or it has it now.
         covered_since_ns: since when (ns) an older track has had the blob it lies in, None: it lies in none.
@@ -194,10 +196,6 @@ class Tracker:
     Args:
         parameters: those under "Tracks".
         sensor_size: width and height (px); a prediction ends at the sensor's border.
-
-    Attributes:
-        threshold: the index threshold now.
-        most_new: so many tracks may begin at the next hop.
     """
 
     def __init__(self, parameters: Parameters, sensor_size: tuple[int, int]) -> None:
@@ -207,8 +205,8 @@ class Tracker:
         self._merge_after_ns = round(parameters.merge_after_s * NS_PER_S)
         self._tracks: dict[int, Track] = {}
         self._next_id = 1
-        self.threshold = parameters.index_threshold
-        self.most_new = parameters.max_tracks
+        self._threshold = parameters.index_threshold
+        self._most_new = parameters.max_tracks
         # Where tracks made room that had had a turn: x, y, radius (px), and when (ns) that ended.
         self._tried_places: deque[tuple[float, float, float, int]] = deque(maxlen=parameters.max_tracks)
 
@@ -241,15 +239,18 @@ class Tracker:
         self, left: list[tuple[int, int]], blobs: Sequence[Blob], lost: tuple[Track, ...], t_hop_ns: int
     ) -> TrackChanges:
         """Begin tracks with the blobs that are left, as far as there is room."""
-        waiting, left = max(0, len(left) - self.most_new), left[: self.most_new]
+        waiting, left = max(0, len(left) - self._most_new), left[: self._most_new]
         evicted = self._make_room(left)
         room = max(0, self._parameters.max_tracks - len(self._tracks))
-        for track in self._tracks.values():
-            track.tentative = self._may_be_clutter(track) and track.last_seen_ns - track.first_seen_ns < _CLUTTER_NS
         new = tuple(self._new_track(blobs[j], t_hop_ns, tried_ns) for tried_ns, j in left[:room])
-        for track in new:
-            track.tentative = self._may_be_clutter(track)
         return TrackChanges(new, lost + evicted, tuple(j for _, j in left[:room]), waiting + len(left) - len(new))
+
+    def heed(self, clutter: Clutter) -> None:
+        """Go on with what clutter asks for: the threshold, how many tracks may begin, and whether they are tentative."""
+        self._threshold, self._most_new = clutter.threshold, clutter.most_new
+        for track in self._tracks.values():
+            seen_ns = track.last_seen_ns - track.first_seen_ns
+            track.tentative = clutter.crowded and track.known_bps is None and seen_ns < _CLUTTER_NS
 
     def exchange(self, track_id: int, other_id: int) -> None:
         """Let two tracks go on where the other one is."""
@@ -324,7 +325,7 @@ class Tracker:
 
     def _may_be_clutter(self, track: Track) -> bool:
         """Return whether there is clutter, and nothing says that a track is not of it."""
-        return self.threshold > self._parameters.index_threshold and track.known_bps is None
+        return self._threshold > self._parameters.index_threshold and track.known_bps is None
 
     def _unfollowed(
         self,
