@@ -7,6 +7,7 @@ import pytest
 
 SCRIPT = """
 import importlib, pkgutil, sys
+from dataclasses import replace
 import numpy as np
 from numba.core.registry import CPUDispatcher
 import beacon_comm.core, beacon_comm.wire
@@ -37,9 +38,9 @@ noise = EventBatch(rng.integers(0, 1280, n).astype(np.uint16), rng.integers(0, 7
 order = np.argsort(np.concatenate((events.t_ns, noise.t_ns)), kind='stable')
 columns = [np.concatenate((getattr(events, c), getattr(noise, c)))[order] for c in ('x', 'y', 'polarity', 't_ns')]
 scene = EventBatch(*columns, int(columns[3][-1]))
-receiver, encoder = Receiver(parameters, size), Evt3Encoder(*size)
+receiver, encoder = Receiver(replace(parameters, new_tracks_burst=0), size), Evt3Encoder(*size)
 packets, arrays = EventStream('event_camera_msgs/msg/EventPacket'), EventStream('dvs_msgs/msg/EventArray')
-missing = 0
+missing, cluttered = 0, False
 cuts = range(NS_PER_S, scene.t_end_ns, 4_000_000)
 for seq, begin in enumerate(cuts):
     start, stop = np.searchsorted(scene.t_ns, (begin, begin + 4_000_000))
@@ -49,9 +50,10 @@ for seq, begin in enumerate(cuts):
         missing += len(part)
         continue
     receiver.push(packets.push(bytearray(cdr) if seq % 2 else cdr).batch)
+    cluttered |= receiver.index_threshold > parameters.index_threshold
     arrays.push(build_event_array(begin, 'camera', *size, part.x, part.y, part.polarity, part.t_ns))
 assert arrays.counts['events'] == packets.counts['events'] == len(scene) - missing
-assert packets.counts['lost_packets'] == 4
+assert packets.counts['lost_packets'] == 4 and cluttered
 for encoding in ('libcaer_cmp', 'libcaer', 'mono'):
     cdr = build_event_packet(0, 'camera', *size, 0, 0, encoding, rng.bytes(6401))
     EventStream('event_camera_msgs/msg/EventPacket').push(cdr)

@@ -62,14 +62,14 @@ def warm_up(parameters: Parameters, pixels: bool = True) -> None:
     """Push synthetic beacons through the reader of every encoding and through a receiver of its own.
 
     What a receiver comes to depends on its parameters: at 20 bit/s nothing is read within a second.  So one with the default
-    rates and windows follows, which comes to everything.
+    rates and windows follows, which comes to everything; its beacons are clutter already.
 
     Args:
         parameters: the receiver's.
         pixels: False: for signals without pixels only, which need neither readers nor detection.
     """
     save_one_at_a_time()
-    some = Parameters(receiver=parameters.receiver, tracker=parameters.tracker)
+    some = Parameters(receiver=parameters.receiver, tracker=parameters.tracker, new_tracks_burst=0)
     rehearse = _rehearse if pixels else _rehearse_signal
     for rehearsed in dict.fromkeys((parameters, some)):
         rehearse(rehearsed)

@@ -197,7 +197,7 @@ class Parameters(Declared):
         0.5, '… and grows over neighbours above this share of it (1: one threshold, as the paper)', '', 0.1, 1.0
     )
     new_tracks_burst: int = parameter(
-        64, 'so many tracks may begin at once; further ones are clutter and raise index_threshold …', '', 1, 1_000_000
+        64, 'so many tracks may begin at once; further ones are clutter and raise index_threshold …', '', 0, 1_000_000
     )
     new_tracks_per_s: float = parameter(2.0, '… for a while, so that in the long run no more than this begin', '1/s', 0.1)
     closing_px: int = parameter(3, 'side of the square of the morphological closing', 'px', 1, 31)
