@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import sys
 import time
 from collections import Counter
@@ -29,17 +28,21 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from beacon_comm.core.candidates import BeaconState
-from beacon_comm.core.character import Status
-from beacon_comm.core.events import NS_PER_S, EventBatch
-from beacon_comm.core.framing import CharacterFrame
-from beacon_comm.core.parameters import Parameters
-from beacon_comm.core.receiver import BeaconSnapshot
-from beacon_comm.recordings.disc import Disc
-from beacon_comm.ros.live import LiveReceiver, Step
-from beacon_comm.simulation.led import OUTDOOR_30_M, sensor_noise, simulate_text, square_wave
-from beacon_comm.wire.cdr import build_event_packet
-from beacon_comm.wire.evt3_encoder import Evt3Encoder
+sys.path.insert(0, str(Path(__file__).resolve().parent))  # PYTHONSAFEPATH leaves it out
+
+from resident_memory import growth, resident_mib  # noqa: E402
+
+from beacon_comm.core.candidates import BeaconState  # noqa: E402
+from beacon_comm.core.character import Status  # noqa: E402
+from beacon_comm.core.events import NS_PER_S, EventBatch  # noqa: E402
+from beacon_comm.core.framing import CharacterFrame  # noqa: E402
+from beacon_comm.core.parameters import Parameters  # noqa: E402
+from beacon_comm.core.receiver import BeaconSnapshot  # noqa: E402
+from beacon_comm.recordings.disc import Disc  # noqa: E402
+from beacon_comm.ros.live import LiveReceiver, Step  # noqa: E402
+from beacon_comm.simulation.led import OUTDOOR_30_M, sensor_noise, simulate_text, square_wave  # noqa: E402
+from beacon_comm.wire.cdr import build_event_packet  # noqa: E402
+from beacon_comm.wire.evt3_encoder import Evt3Encoder  # noqa: E402
 
 WIDTH, HEIGHT = 320, 240
 RATES = (504.0, 3125.0)
@@ -57,7 +60,6 @@ FAINT = replace(
 NEAR_PX = 8.0
 MATCH_SHARE = 0.25
 TOLERANCE_NS = 1_000_000
-LEAST_SIZES, MOST_GROWTH = 3, 1.05
 LAMP_HZ, LAMP_SHARE = 100.0, 0.3
 STAMP_NS = 1_700_000_000 * NS_PER_S
 TYPE = 'event_camera_msgs/msg/EventPacket'
@@ -224,21 +226,6 @@ class Hour:
         place = (t_ns - shown.start_ns) * shown.clip.bit_rate_bps / NS_PER_S / CharacterFrame().length
         k = round(place)
         return abs(place - k) < MATCH_SHARE and 0 <= k < len(shown.clip.text) and ord(shown.clip.text[k]) == code
-
-
-def resident_mib() -> float:
-    """Return the memory that the process holds (MiB)."""
-    pages = int(Path('/proc/self/statm').read_text().split()[1])
-    return pages * os.sysconf('SC_PAGE_SIZE') / 2**20
-
-
-def growth(sizes_mib: list[float]) -> list[str]:
-    """Return a broken promise if the last third of the sizes (MiB) is above the middle one; too few tell nothing."""
-    third = len(sizes_mib) // 3
-    if third < LEAST_SIZES:
-        return []
-    before, after = (float(np.median(part)) for part in (sizes_mib[third:-third], sizes_mib[-third:]))
-    return [f'memory grew from {before:.0f} to {after:.0f} MiB'] if after > before * MOST_GROWTH else []
 
 
 def run(minutes: float, seed: int, quiet: bool = False) -> Tally:

@@ -14,7 +14,7 @@
 Two processes: the first has numba off, so that Python itself sees every line of the decoders and refuses an index
 beyond an array, and one below it; the second has numba's bounds checks on.  Of every message it is held that nothing is
 raised, that times do not step back, and that no event lies outside the sensor; of every file, that the only error is the
-one that the tools show.
+one that the tools show; of the process, that its memory does not grow.
 """
 
 from __future__ import annotations
@@ -39,6 +39,10 @@ from typing import Any
 
 import numpy as np
 from tqdm import tqdm
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))  # PYTHONSAFEPATH leaves it out
+
+from resident_memory import growth, resident_mib  # noqa: E402
 
 PACKET, FORMER_PACKET = 'event_camera_msgs/msg/EventPacket', 'event_array_msgs/msg/EventArray'
 ARRAYS = ('dvs_msgs/msg/EventArray', 'prophesee_event_msgs/msg/EventArray', 'dv_ros2_msgs/msg/EventArray')
@@ -303,12 +307,6 @@ def hammer(count: int, seed: int, corpus: list[Sample], quiet: bool = False) -> 
     return readers, sizes
 
 
-def resident_mib() -> float:
-    """Return the memory that the process holds (MiB)."""
-    pages = int(Path('/proc/self/statm').read_text().split()[1])
-    return pages * os.sysconf('SC_PAGE_SIZE') / 2**20
-
-
 def through_the_receiver(count: int, seed: int, corpus: list[Sample], quiet: bool = False) -> Counter[str]:
     """Push messages through live receivers, detection and all; return what they counted."""
     from beacon_comm.core.parameters import Parameters
@@ -476,7 +474,10 @@ def main() -> int:
     print(table('receiver', {'all types': live}))
     print(table('files', files))
     print(f'memory held (MiB), at every tenth of the messages: {", ".join(f"{size:.0f}" for size in sizes)}')
-    return 0
+    problems = growth(sizes)
+    for problem in problems:
+        print(f'broken: {problem}')
+    return 1 if problems else 0
 
 
 if __name__ == '__main__':
