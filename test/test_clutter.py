@@ -19,29 +19,38 @@ ALLOWED = Parameters(new_tracks_burst=20, new_tracks_per_s=5.0)
 
 def test_the_threshold_stays_where_it_was_set_within_the_allowance():
     clutter = Clutter(ALLOWED)
-    clutter.count(20, HOP_NS)
+    clutter.count(20, 0, HOP_NS)
     for k in range(2, 400):
-        clutter.count(1 if k % 20 == 0 else 0, k * HOP_NS)  # 5 a second
+        clutter.count(1 if k % 20 == 0 else 0, 0, k * HOP_NS)  # 5 a second
         assert clutter.threshold == ALLOWED.index_threshold
 
 
 def test_new_tracks_beyond_the_allowance_double_it_and_time_halves_it_again():
     clutter = Clutter(ALLOWED)
-    clutter.count(20 + DOUBLING, HOP_NS)
+    clutter.count(20 + DOUBLING, 0, HOP_NS)
     assert clutter.threshold == pytest.approx(2 * ALLOWED.index_threshold)
-    clutter.count(0, HOP_NS + round(DOUBLING / 5.0 * NS_PER_S))
+    clutter.count(0, 0, HOP_NS + round(DOUBLING / 5.0 * NS_PER_S))
     assert clutter.threshold == pytest.approx(ALLOWED.index_threshold)
+
+
+def test_tracks_that_are_read_were_no_clutter():
+    clutter = Clutter(ALLOWED)
+    clutter.count(20 + 2 * DOUBLING, 0, HOP_NS)
+    clutter.count(0, DOUBLING, HOP_NS)
+    assert clutter.threshold == pytest.approx(2 * ALLOWED.index_threshold)
+    clutter.count(0, 1000, HOP_NS)
+    assert clutter.threshold == ALLOWED.index_threshold and clutter.most_new == 20 + DOUBLING
 
 
 @given(st.lists(st.integers(0, 1000), min_size=50, max_size=300))
 def test_it_is_bounded_and_so_is_the_time_that_it_takes_to_fall(new):
     clutter = Clutter(ALLOWED)
     for k, count in enumerate(new):
-        clutter.count(min(count, clutter.most_new), k * HOP_NS)
+        clutter.count(min(count, clutter.most_new), 0, k * HOP_NS)
         assert 1.0 <= clutter.threshold / ALLOWED.index_threshold <= 2.0**MOST_DOUBLINGS
         assert DOUBLING <= clutter.most_new <= 20 + DOUBLING
     falls_ns = round((20 + DOUBLING * MOST_DOUBLINGS) / 5.0 * NS_PER_S)
-    clutter.count(0, len(new) * HOP_NS + falls_ns)
+    clutter.count(0, 0, len(new) * HOP_NS + falls_ns)
     assert clutter.threshold == ALLOWED.index_threshold and clutter.most_new == 20 + DOUBLING
 
 
@@ -153,3 +162,20 @@ def test_what_begins_in_a_crowd_is_tentative_and_nothing_else(count):
     detect(detector, merged(*lights), lambda *_: tentative.append([one.tentative for one in detector.tracks.values()]))
     assert len(detector.tracks) == count and detector.index_threshold == 0.6
     assert any(map(any, tentative)) == (count > CROWD) and not any(tentative[-1])
+
+
+@pytest.mark.parametrize('are_read', [True, False])
+def test_more_beacons_than_may_begin_at_once_are_all_followed_once_they_are_read(are_read):
+    lights = [
+        disc(20.0 + 30.0 * (k % 5), 15.0 + 25.0 * (k // 5), duration_s=1.5, rate_per_s=20_000 + 3_000 * k, seed=k)
+        for k in range(20)
+    ]
+    detector = Detector(Parameters(new_tracks_burst=4), SIZE)
+
+    def read(_, __):
+        for track in detector.tracks.values():
+            if are_read and not track.tentative and track.last_seen_ns - track.first_seen_ns > 50_000_000:
+                track.bit_rate_bps = 504.0
+
+    detect(detector, merged(*lights), read)
+    assert (len(detector.tracks) == len(lights) and detector.index_threshold == 0.6) == are_read

@@ -1,11 +1,15 @@
 """Clutter: the index threshold that keeps the rate of new tracks bounded (a detector of constant false-alarm rate).
 
-    new tracks of a hop ──► level, which leaks at new_tracks_per_s ──► index_threshold × 2^(what is beyond the allowance / 4)
+    new tracks of a hop ────────────┐ +1 each
+                                    ▼
+    tracks whose bit rate is known ─► level, which leaks at new_tracks_per_s ─► index_threshold × 2^(what is beyond the
+      now: those were no clutter      -1 each                                                        allowance / 4)
 
 A camera that moves over texture, or that sees enough events for every pixel to have some of both polarities, has hundreds of
 blobs a hop at a threshold that is right for a quiet view: every one costs, and beacons wait behind them for their turn.  A
 beacon among them that is to be read is far above them.  So every new track beyond an allowance raises the threshold, and it
-falls again by itself: in the long run there are no more new tracks than the level leaks, whatever the view is.  As long as
+falls again by itself.  A track whose bit rate becomes known was no clutter, and is taken back: a hundred beacons may come at
+once.  In the long run there are no more tracks that nobody can read than the level leaks, whatever the view is.  As long as
 there are no more than ``new_tracks_burst`` at once, and no more than the leak later, the threshold is ``index_threshold``.
 """
 
@@ -49,11 +53,11 @@ class Clutter:
         """Whether many tracks began lately."""
         return self._level > CROWD
 
-    def count(self, new_tracks: int, t_hop_ns: int) -> None:
-        """Hear of the tracks that began at the hop that ends at ``t_hop_ns`` (ns)."""
+    def count(self, new_tracks: int, read_tracks: int, t_hop_ns: int) -> None:
+        """Hear of the tracks that began, and whose bit rate is known now, at the hop that ends at ``t_hop_ns`` (ns)."""
         leaked = self._leak_per_ns * max(0, t_hop_ns - self._t_ns)
         most = self._allowed + DOUBLING * MOST_DOUBLINGS
-        self._level = min(max(0.0, self._level - leaked) + new_tracks, most)
+        self._level = min(max(0.0, self._level - leaked - read_tracks) + new_tracks, most)
         self._t_ns = t_hop_ns
         beyond = math.floor(max(0.0, self._level - self._allowed))
         self.threshold = self._least * 2.0 ** (beyond / DOUBLING)

@@ -231,7 +231,7 @@ class Detector:
         blobs = self._blobs.find(self._images, t_hop_ns, self._router.near)
         changes = self._tracker.update(blobs, t_hop_ns)
         self._router.aim(tuple(self._tracker.tracks.values()), t_hop_ns)
-        self._clutter.count(len(changes.new_blobs), t_hop_ns)
+        self._clutter.count(len(changes.new_blobs), self._tracker.count_read(), t_hop_ns)
         self._heed_clutter()
         self._untidied = _Untidied(routed, exchanged, blobs, changes, t_hop_ns)
         self._stats.hops += 1

@@ -67,6 +67,7 @@ class Track:
         matched_ns: the last hop (ns) that had a blob of it.
         held: a demodulator listens to it.
         tentative: many began with it, and it has not been seen for long: no demodulator is to listen to it yet.
+        read: its bit rate was known at a hop.
         tried_ns: when (ns) its last turn at a demodulator ended, or that of the track that made room there; None: there was
             none, or it has it now.
         covered_since_ns: since when (ns) an older track has had the blob it lies in, None: it lies in none.
@@ -96,6 +97,7 @@ class Track:
     matched_ns: int = 0
     held: bool = False
     tentative: bool = False
+    read: bool = False
     tried_ns: int | None = None
     covered_since_ns: int | None = None
     bit_rate_bps: float | None = None
@@ -251,6 +253,13 @@ class Tracker:
         for track in self._tracks.values():
             seen_ns = track.last_seen_ns - track.first_seen_ns
             track.tentative = clutter.crowded and track.known_bps is None and seen_ns < _CLUTTER_NS
+
+    def count_read(self) -> int:
+        """Return of how many tracks the bit rate has become known since it was asked for last."""
+        read = [track for track in self._tracks.values() if track.known_bps is not None and not track.read]
+        for track in read:
+            track.read = True
+        return len(read)
 
     def exchange(self, track_id: int, other_id: int) -> None:
         """Let two tracks go on where the other one is."""
