@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))  # PYTHONSAFEPATH leave
 
 from live import Phase, can_publish_arrays, measure  # noqa: E402
 from measuring import ChainRun, MetricTable, best_s, mev_per_s, module_ns, run_chain  # noqa: E402
-from streams import LOOP_NS, PACKET_NS, WORDS_BAG, Repeated, Stream, make_stream, messages, own_rate, real_words  # noqa: E402
+from streams import BAG, LOOP_NS, PACKET_NS, WORDS_BAG, Repeated, Stream, make_stream, messages, real_words  # noqa: E402
 
 from beacon_comm.compiling.warm_up import warm_up  # noqa: E402
 from beacon_comm.core.detection import Detector  # noqa: E402
@@ -166,18 +166,14 @@ def chain(folder: Path) -> MetricTable:
 
 def chain_messages(folder: Path, size: tuple[int, int], events_per_s: float | None) -> tuple[Stream, list[bytes]]:
     """Return a stream with two beacons, and its messages for :data:`CHAIN_ROUNDS` rounds; None: the bag of real words."""
-    if events_per_s is None:
-        rate, packet_ns, bag = own_rate(folder, WORDS_BAG), REAL_PACKET_NS, WORDS_BAG
-        stream = make_stream(folder, size, rate, LOOP_S, packet_ns=packet_ns, repeatable=True, bag=bag)
-    else:
-        packet_ns = PACKET_NS
-        stream = make_stream(folder, size, events_per_s, LOOP_S, repeatable=True)
-    return stream, rounds(stream, CHAIN_ROUNDS, packet_ns)
+    bag, packet_ns = (WORDS_BAG, REAL_PACKET_NS) if events_per_s is None else (BAG, PACKET_NS)
+    stream = make_stream(folder, size, events_per_s, LOOP_S, packet_ns=packet_ns, repeatable=True, bag=bag)
+    return stream, rounds(stream, CHAIN_ROUNDS)
 
 
-def rounds(stream: Stream, count: int, packet_ns: int = PACKET_NS) -> list[bytes]:
+def rounds(stream: Stream, count: int) -> list[bytes]:
     """Return a repeatable stream's messages, so many rounds of them."""
-    return list(islice(Repeated(stream, 'evt3', packet_ns), count * len(stream.batches)))
+    return list(islice(Repeated(stream, 'evt3'), count * len(stream.batches)))
 
 
 def numpy_mev_per_s(cdrs: Sequence[bytes], size: tuple[int, int], parameters: Parameters) -> float:
@@ -265,7 +261,7 @@ def scaling(folder: Path) -> MetricTable:
         for rate in SCALING_RATES:
             for count in SCALING_BEACONS:
                 stream = make_stream(folder, size, rate, LOOP_S, count, packet_ns=SCALING_PACKET_NS, repeatable=True)
-                cdrs = rounds(stream, 2, SCALING_PACKET_NS)
+                cdrs = rounds(stream, 2)
                 run = best_chain(cdrs, size, Parameters(receiver='threshold', candidate_slots=80), len(stream.batches))
                 hop_count = stream.seconds * 100
                 key = f'scaling_{name}_{rate / 1e6:g}mev_{count}_beacons'

@@ -84,7 +84,7 @@ def bag_events(path: Path) -> EventBatch:
 
 
 def tiled(
-    once: EventBatch, bag_size: tuple[int, int], size: tuple[int, int], events_per_s: float, duration_ns: int
+    once: EventBatch, bag_size: tuple[int, int], size: tuple[int, int], events_per_s: float | None, duration_ns: int
 ) -> EventBatch:
     """Return the bag's events side by side all over the sensor and over and over, from time 0 on.
 
@@ -92,14 +92,16 @@ def tiled(
         once: the bag's events.
         bag_size: width and height of its sensor (px).
         size: width and height of the sensor to fill (px).
-        events_per_s: how many there are to be.
+        events_per_s: how many there are to be; None: at the bag's own pace.
         duration_ns: until when (ns).
     """
     width, height = size
     corners = [(left, top) for left in range(0, width, bag_size[0]) for top in range(0, height, bag_size[1])]
     inside = [(once.x + left < width) & (once.y + top < height) for left, top in corners]
-    period_ns = round(sum(int(which.sum()) for which in inside) / events_per_s * NS_PER_S)
-    faster = period_ns / (int(once.t_ns[-1] - once.t_ns[0]) + 1000)
+    period_ns = length_ns = int(once.t_ns[-1] - once.t_ns[0]) + 1000
+    if events_per_s is not None:
+        period_ns = round(sum(int(which.sum()) for which in inside) / events_per_s * NS_PER_S)
+    faster = period_ns / length_ns
     parts = []
     for k, ((left, top), which) in enumerate(zip(corners, inside, strict=True)):
         t_ns = ((once.t_ns - once.t_ns[0])[which] * faster).astype(np.int64) + k * period_ns // len(corners)
@@ -165,16 +167,10 @@ def beacons(
     return placed
 
 
-def own_rate(folder: Path, bag: str) -> float:
-    """Return how many events a second a bag has."""
-    events = bag_events(folder / bag)
-    return len(events) / (int(events.t_ns[-1] - events.t_ns[0]) + 1000) * NS_PER_S
-
-
 def make_stream(
     folder: Path,
     size: tuple[int, int],
-    events_per_s: float,
+    events_per_s: float | None,
     duration_s: float,
     beacon_count: int = 2,
     packet_ns: int = PACKET_NS,
@@ -186,7 +182,7 @@ def make_stream(
     Args:
         folder: of the recordings.
         size: width and height (px).
-        events_per_s: of the background.
+        events_per_s: of the background; None: at its bag's own pace.
         duration_s: length of the stream (s).
         beacon_count: how many.
         packet_ns: length of a packet (ns).
@@ -195,7 +191,7 @@ def make_stream(
     """
     duration_ns = round(duration_s * NS_PER_S)
     parts = beacons(folder, size, beacon_count, duration_ns, repeatable)
-    if events_per_s:
+    if events_per_s != 0.0:
         parts.insert(0, tiled(bag_events(folder / bag), BAG_SIZE[bag], size, events_per_s, duration_ns))
     t_ns = np.concatenate([part.t_ns for part in parts]) // 1000 * 1000 + START_NS
     order = np.argsort(t_ns, kind='stable')
@@ -254,11 +250,11 @@ _PAYLOADS = {'mono': _mono, 'libcaer': _libcaer, 'libcaer_cmp': _libcaer_cmp}
 class Repeated:
     """A stream's messages round and round: their times go on, and so do the numbers of the packets."""
 
-    def __init__(self, stream: Stream, encoding: str, packet_ns: int = PACKET_NS) -> None:
+    def __init__(self, stream: Stream, encoding: str) -> None:
         self.events = np.array([len(batch) for batch in stream.batches])
         self._size = (stream.width, stream.height)
         self._encoding = encoding
-        self._packet_ns = packet_ns
+        self._packet_ns = LOOP_NS // len(stream.batches)
         self._cdrs = [bytearray(cdr) for cdr in messages(stream, encoding)]
         self._rounds = 0
         if encoding == 'evt3':
