@@ -258,7 +258,7 @@ class MotionTracker(Tracker):
 
     def _index_threshold(self, track: MotionTrack) -> float:
         """Return the threshold for a track: what sends at a known bit rate is no clutter."""
-        return self._threshold if track.known_bps is None else self._parameters.index_threshold
+        return self._threshold if self._may_be_clutter(track) else self._parameters.index_threshold
 
     def clear(self, sensor_size: tuple[int, int]) -> TrackChanges:
         """Lose every track and go on with a sensor size; labels go on."""
